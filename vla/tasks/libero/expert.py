@@ -36,6 +36,8 @@ FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approach
 HAND = 0.10  # half of the width of the hand over the fingers [m]
 MARGIN = 0.015  # height of open fingers over what they must not touch [m]
 FINGER, OPEN = 0.012, 0.037  # half of a finger's breadth; distance of an open finger from the middle [m]
+THIN = 0.004  # least of what the fingers hold [m]
+FIRM = -0.9  # at which they press as much as they can
 HELD = -0.3  # largest commanded opening at which the fingers press
 ARM = (0.34, 0.72)  # horizontal distances from the base between which the arm neither folds up nor stretches [m]
 CARRY = 0.05  # height over all that is on the way [m]
@@ -117,6 +119,7 @@ class Situation:
         poses = {body: (pose[:3], pose[3:]) for body, pose in zip(bodies, truth["fixtures"], strict=True)}
         set_start(self.model, self.data, Start(truth["positions"], poses))
         self.opening = float(truth["opening"][0])
+        self.gap = float(self.data.qpos[7] - self.data.qpos[8])  # between the fingers [m]
         self.hand = self.data.site_xpos[self._site].copy()
         self.rotation = self.data.site_xmat[self._site].reshape(3, 3).copy()
         self.yaw = float(np.arctan2(-self.rotation[0, 0], self.rotation[0, 1]))
@@ -125,14 +128,14 @@ class Situation:
         """Return the command (7,) for this state."""
         todo = [part for part in self.parts if not self.goal.holds(self.data, *part)]
         touched = self._touched()
-        if not todo or (touched is not None and all(part[1] != touched for part in todo)):
+        if not todo or (touched is not None and all(self._subject(part[1]) != touched for part in todo)):
             return self._command(self.hand, self.yaw, -1.0)  # let go of what is where it should be
         held = touched if self.opening < HELD else None
         part = next((part for part in todo if held is not None and part[1] == held), todo[0])
         if part[0] in ("on", "in") and part[1] != held and self._shut(part[2]):
             part = ("open", part[2])
         if part[0] == "open":
-            return self._pull(part[1], touched)
+            return self._pull(part[1])
         if self.rotation[2, 2] > UPRIGHT:
             return self._withdraw()
         if part[0] == "turnon":
@@ -179,21 +182,20 @@ class Situation:
         )
         return self._command(self._rising(self.hand + offset + np.array([0.0, 0.0, lift])), self.yaw, 1.0)
 
-    def _pull(self, place: str, touched: str | None) -> Array:
+    def _pull(self, place: str) -> Array:
         """Open a drawer by its handle: the hand comes from the front, one finger over the bar and one under it."""
         joint = int(self.goal.joints(place)[0])
         way = -self.data.xaxis[joint]  # openings are negative
         parts = self._moving(joint)
         bar = max(parts, key=lambda points: float((points @ way).max()))
-        middle = (bar.max(axis=0) + bar.min(axis=0)) / 2
+        middle = (bar.max(axis=0) + bar.min(axis=0)) / 2 - 0.006 * way
         turned = np.stack([UP, np.cross(-way, UP), -way], axis=1)
-        if touched is not None and self.opening < HELD:
-            return self._move(self.hand + 0.05 * way, turned, 1.0)
         offset = self.hand - middle
         before, aside = float(offset @ way), float(np.linalg.norm(offset - (offset @ way) * way))
         wrong = float(np.linalg.norm(self._turn(turned)))
-        if aside < NEAR and wrong < 2 * TURNED and abs(before) < LEVEL:
-            return self._move(middle, turned, 1.0)
+        if aside < 1.5 * NEAR and wrong < 2 * TURNED and abs(before) < 2 * LEVEL:
+            grips = self.opening < FIRM and self.gap > THIN
+            return self._move(middle + (0.012 if grips else 0.0) * way, turned, 1.0)  # slowly, or the fingers slip
         if aside < 2 * NEAR and wrong < 2 * TURNED and self.opening > 0.9:
             return self._move(middle, turned, -1.0)
         if before < 0.09 and self.hand[2] < self._tops().max() and wrong > 0.5:
@@ -245,13 +247,18 @@ class Situation:
             return self._move(self.hand - 0.05 * self.rotation[:, 2], self.rotation, -1.0)
         return self._command(self.hand + np.array([0, 0, 0.03]), 0.0, -1.0)
 
+    def _subject(self, name: str) -> str:
+        """Return the thing that a name is of: itself, or what a region belongs to."""
+        if name in self.goal.bodies:
+            return name
+        owner = self.goal.owner[self.model.site_bodyid[self.goal.sites[name]]]
+        return next((thing for thing, root in self.goal.bodies.items() if root == owner), "")
+
     def _shut(self, place: str) -> bool:
         """Return whether a place is in a drawer or behind a door that must be opened first."""
         if place in self.goal.bodies or not len(self.goal.joints(place)):
             return False
-        body = int(self.model.site_bodyid[self.goal.sites[place]])
-        name = next((name for name, root in self.goal.bodies.items() if root == self.goal.owner[body]), "")
-        return name.startswith(("wooden_cabinet", "white_cabinet")) and not self.goal.holds(self.data, "open", place)
+        return self._subject(place).startswith(("wooden_cabinet", "white_cabinet")) and not self.goal.holds(self.data, "open", place)
 
     # Geometry
 
@@ -381,8 +388,17 @@ class Situation:
             near = support[np.linalg.norm(support[:, :2] - middle[:2], axis=1) < 0.03]
             return np.array([*middle[:2], (near if len(near) else support)[:, 2].max() + below + 0.004])
         site = self.goal.sites[place]
-        middle, size = data.site_xpos[site], self.model.site_size[site]
-        return np.array([*middle[:2], middle[2] - size[2] + below + 0.01])
+        middle, size, turn = data.site_xpos[site], self.model.site_size[site], data.site_xmat[site].reshape(3, 3)
+        extent = np.abs(turn) @ size  # of the region along the axes of the world
+        floor = middle[2] - extent[2]
+        rest = self._others(thing)
+        rest = rest[(rest[:, 2] > floor + 0.012) & (np.abs(rest[:, :2] - middle[:2]) < extent[:2] + 0.15).all(axis=1), :2]
+        radius = float(np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=1).max())
+        steps = np.stack(np.meshgrid(*[np.linspace(-0.8, 0.8, 7)] * 2), axis=-1).reshape(-1, 2)
+        spots = middle[:2] + steps * extent[:2]
+        gaps = np.linalg.norm(spots[:, None] - rest, axis=2).min(axis=1, initial=1.0)
+        costs = 2 * np.maximum(0.0, radius + 0.005 - gaps) + 0.1 * np.linalg.norm(steps * extent[:2], axis=1)
+        return np.array([*spots[int(np.argmin(costs))], floor + below + 0.01])
 
     def _above(self, thing: str, spot: Array) -> float:
         """Return by how much a thing must be higher than its spot to pass over all between it and the spot [m]."""
