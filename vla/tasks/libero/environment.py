@@ -37,8 +37,8 @@ Numbers = Annotated[list[Annotated[int, Ge(0), Le(9)]], MinLen(1), Predicate(uni
 class Libero(Blindable):
     """Tasks of a Panda on a table, a floor or in a kitchen, one of them per episode: seeds take them in turn.
 
-    Success is the first step that LIBERO calls one; an episode ends with it, or when its steps are used up. The state is
-    the position of the grip and the rotation vector of the hand in the world's frame, and the fingers' positions. An
+    Success is the first step that LIBERO calls one; an episode ends with it, or when its steps are used up. The state
+    is the position of the grip and the rotation vector of the hand in the world's frame, and the fingers' positions. An
     action is a displacement and a rotation vector of the hand, in the world's axes and relative to where it is, and the
     gripper's opening; the controller reaches about a quarter of a displacement within a step.
     """

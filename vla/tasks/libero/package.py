@@ -1,7 +1,7 @@
 """The files of LIBERO's wheels, which are read and never imported, and what its tasks are.
 
-`scenes.tar.xz` beside this module has the scenes that robosuite makes of LIBERO's descriptions (tools/libero/compose.py,
-with their origin and licences); meshes, textures and initial states are those of the wheels.
+`scenes.tar.xz` beside this module has the scenes that robosuite makes of LIBERO's descriptions
+(tools/libero/compose.py, with their origin and licences); meshes, textures and initial states are those of the wheels.
 """
 
 from __future__ import annotations
@@ -105,19 +105,21 @@ def tasks_of(suite: str) -> tuple[Task, ...]:
     entries = known[f"libero_{'10' if kind == 'long' else kind}{'_' + change if change else ''}"]
     if missing := [number for number, entry in enumerate(entries) if "scene" not in entry]:
         raise UserError(f"the wheels lack what tasks {missing} of {suite} are made of: name others in task.tasks")
-    return tuple(
-        Task(
-            suite,
-            number,
-            entry["scene"],
-            entry["instruction"],
-            *(tuple(map(tuple, entry[key])) for key in ("goal", "initial")),
-            entry["regions"],
-            entry["fixtures"],
-            tuple(entry["interest"]),
-            entry["states"],
-        )
-        for number, entry in enumerate(entries)
+    return tuple(_task(suite, number, entry) for number, entry in enumerate(entries))
+
+
+def _task(suite: str, number: int, entry: Mapping[str, Any]) -> Task:
+    return Task(
+        suite=suite,
+        number=number,
+        scene=entry["scene"],
+        instruction=entry["instruction"],
+        goal=tuple(map(tuple, entry["goal"])),
+        initial=tuple(map(tuple, entry["initial"])),
+        regions=entry["regions"],
+        fixtures=entry["fixtures"],
+        interest=tuple(entry["interest"]),
+        states=entry["states"],
     )
 
 

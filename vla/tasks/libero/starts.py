@@ -62,10 +62,11 @@ class Starts:
         Things on a table are drawn in the ranges of their regions, others, and openings, within what the official
         states span; heights and tilts are those of the official states, which are alike in them.
         """
+        start = self._draw(random)
         for _ in range(DRAWS):
-            start = self._draw(random)
             if not self._overlaps(start):
                 break
+            start = self._draw(random)
         return start
 
     def _draw(self, random: np.random.Generator) -> Start:
