@@ -19,7 +19,9 @@ CUBE = 0.012  # edge of the cubes in which one point stands for all, where a thi
 HELD = -0.3  # largest commanded opening at which the fingers press
 SHUT = -0.99  # largest commanded opening at which the fingers press as much as they can
 THIN = 0.003  # least distance of fingers that hold something [m]
-WRIST = 2.5  # largest turn of the last joint either way, whose limit is 2.9 [rad]
+WRIST = 2.7  # largest turn of the last joint either way, whose limit is 2.9 [rad]
+SMALL = 0.2  # turn that is done wherever the last joint is [rad]
+SLANT = 0.3  # largest vertical component of the direction in which the fingers of such a hand close
 UPRIGHT = -0.6  # largest vertical component of where a hand that points down points
 
 
@@ -60,8 +62,8 @@ class Situation:
 
     @property
     def upright(self) -> bool:
-        """Whether the hand points down."""
-        return bool(self.rotation[2, 2] < UPRIGHT)
+        """Whether the hand points down, if leaning, and its fingers close horizontally."""
+        return bool(self.rotation[2, 2] < UPRIGHT and abs(self.rotation[2, 0]) < SLANT)
 
     def turn_to(self, yaw: float) -> float:
         """Return the rotation [rad] to a yaw: the fingers are alike, so half a turn more or less is the same.
@@ -70,7 +72,8 @@ class Situation:
         """
         turns = yaw - self.yaw + np.pi * np.arange(-3, 4)
         wrist = self.data.qpos[6] - turns
-        return float(min(zip(turns, wrist, strict=True), key=lambda one: (abs(one[1]) > WRIST, abs(one[0])))[0])
+        strained = (np.abs(wrist) > WRIST) & (np.abs(turns) > SMALL)
+        return float(turns[int(np.lexsort((np.abs(turns), strained))[0])])
 
     def origin(self, thing: str) -> Array:
         """Return the origin (3,) of a thing [m]."""

@@ -10,7 +10,7 @@ from vla.tasks.libero.controller import REACH
 from vla.tasks.libero.grasps import Grasp, parts
 from vla.tasks.libero.places import Place
 from vla.tasks.libero.room import HAND, TIP, axes
-from vla.tasks.libero.situation import HELD, THIN, Situation
+from vla.tasks.libero.situation import THIN, Situation
 
 GAIN = 3.0  # of the distance to go, in a command: less leaves the hand a centimetre away from where it is to be
 TURN_GAIN = 1.0  # of the rotation to go: more is unstable where the arm folds up
@@ -143,7 +143,7 @@ def twist(at: Situation, thing: str) -> Array:
     moving = at.moving(joint)
     grasp = min(parts(moving, alone=False), key=lambda one: one[0] + 0.02 * abs(at.turn_to(one[1].yaw)))[1]
     grasp = Grasp(np.array([*at.data.xanchor[joint][:2], grasp.position[2]]), grasp.yaw)
-    holds = at.opening < HELD and at.gap > THIN and np.linalg.norm(at.hand - grasp.position) < 3 * NEAR
+    holds = at.opening < FIRM and at.gap > THIN and np.linalg.norm(at.hand - grasp.position) < 3 * NEAR
     if holds:
         return command(at, grasp.position, at.yaw + 0.4, 1.0)
     return approach(at, grasp, np.concatenate(moving), thing)
@@ -188,7 +188,8 @@ def withdraw(at: Situation) -> Array:
     near = at.others("", at.hand, 0.1)
     if len(near) and np.linalg.norm(near - at.hand, axis=1).min() < 0.09:
         return move(at, at.hand - 0.05 * at.rotation[:, 2], at.rotation, -1.0)
-    return command(at, at.hand + 0.03 * UP, 0.0, -1.0)
+    inwards = at.base - at.hand  # not to a stretched arm
+    return command(at, at.hand + np.array([*(0.05 * inwards[:2] / np.hypot(*inwards[:2])), 0.02]), 0.0, -1.0)
 
 
 def tops(at: Situation) -> float:
