@@ -7,7 +7,7 @@ import numpy as np
 
 from vla.spec import Array
 from vla.tasks.libero.controller import REACH
-from vla.tasks.libero.grasps import Grasp, parts
+from vla.tasks.libero.grasps import LEAN, Grasp, parts
 from vla.tasks.libero.places import Place
 from vla.tasks.libero.room import HAND, TIP, axes
 from vla.tasks.libero.situation import THIN, Situation
@@ -49,9 +49,9 @@ def approach(at: Situation, grasp: Grasp, points: Array, thing: str, opening: fl
 
 def carry(at: Situation, thing: str, place: Place) -> Array:
     """Carry the held thing to a place, and let go of it there."""
-    origin, yaw = at.origin(thing), at.yaw + place.turn
+    origin, yaw, lean = at.origin(thing), at.yaw + place.turn, LEAN * round(at.lean / LEAN)
     if place.hidden is not None:
-        return command(at, at.hand + place.hidden + 0.01 * UP, yaw, 1.0, at.lean)
+        return command(at, at.hand + place.hidden + 0.01 * UP, yaw, 1.0, lean)
     if place.out is not None:
         way = place.out / np.linalg.norm(place.out)
         offset = origin - place.spot
@@ -60,16 +60,16 @@ def carry(at: Situation, thing: str, place: Place) -> Array:
         if aside > 0.02 or before > np.linalg.norm(place.out) + 0.03:
             place = Place(place.spot + place.out, place.turn, 0.0)
         elif before > 0.004:
-            return command(at, at.hand + place.spot - origin, yaw, 1.0, at.lean)
+            return command(at, at.hand + place.spot - origin, yaw, 1.0, lean)
     offset = place.spot - origin
     away = float(np.hypot(*offset[:2]))
     if away < min(0.015, place.slack) and offset[2] > -0.012 and abs(place.turn) < TURNED:
-        return command(at, at.hand, yaw, -1.0, at.lean)
+        return command(at, at.hand, yaw, -1.0, lean)
     away += 0.1 * abs(place.turn)
     lift = min(FUNNEL * away, CARRY) if away > 0.6 * place.slack else 0.0
     if away > place.slack:
         lift += max(0.0, _above(at, thing, place.spot))
-    return command(at, rising(at, at.hand + offset + lift * UP), yaw, 1.0, at.lean)
+    return command(at, rising(at, at.hand + offset + lift * UP), yaw, 1.0, lean)
 
 
 def alike(at: Situation, grasp: Grasp) -> Grasp:
