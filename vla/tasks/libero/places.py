@@ -17,6 +17,7 @@ ASIDE = 0.012  # between a thing and a drawer that is to be opened [m]
 SLIT = 0.008  # between a thing and what it passes [m]
 PUSHED = 0.06  # by which other things may be pushed by one that is dragged [m]
 SQUARE = 0.01  # edge of the squares in which one point stands for all that are over each other [m]
+STAY = 0.3  # cost per metre of a place from where the thing is carried: the choice stays the same
 FLOOR = 0.012  # height over the floor of a region of what is in the way there [m]
 THICK = 0.03  # largest height of what carries things over the middle of a flat region [m]
 GRID = np.stack(np.meshgrid(*[np.linspace(-0.8, 0.8, 5)] * 2), axis=-1).reshape(-1, 2)
@@ -93,6 +94,7 @@ def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
         gaps, roofs = form.room(spots, rest)
         costs = away + 2 * np.maximum(0, MARGIN - gaps) + ROOFED * roofs
         if held:
+            costs += STAY * np.linalg.norm(spots[:, :2] - origin[:2], axis=1)
             hands = spots + turned(turn) @ (at.hand - origin)
             costs += np.maximum(0, CLEAR - clearance(hands, np.full(len(hands), at.yaw + turn), rest)) + far(at, hands)
         one = int(np.argmin(costs))
@@ -151,7 +153,7 @@ class _Form:
         over = rest[:, 2] > spots[0, 2] + self._height
         covered = (self._gaps(spots, _flat(rest[over])) < -MARGIN).sum(axis=1)
         gaps = self._gaps(spots, _flat(rest[~over]))
-        return gaps.min(axis=1, initial=1.0), covered / max(int(covered.max(initial=0)), 1)
+        return gaps.min(axis=1, initial=1.0), (covered > 0) / 2 + covered / max(2 * int(covered.max(initial=0)), 1)
 
     def out(
         self,

@@ -129,6 +129,12 @@ class Situation:
         held = touched[0] | touched[1] if shut else touched[0] & touched[1]
         return next((name for name, body in self.goal.bodies.items() if body in held and body in self._movable), None)
 
+    def rests(self, thing: str) -> bool:
+        """Return whether a thing touches another one."""
+        root = self.goal.bodies[thing]
+        owners = self.goal.owner[self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]]
+        return bool(((owners == root).any(axis=1) & (owners > 0).all(axis=1) & (owners != root).any(axis=1)).any())
+
     def _place(self, thing: str, body: int) -> list[Array]:
         """Return points (N, 3) on each geom of a body [m]; those of bodies that did not move are kept."""
         pose = np.concatenate([self.data.xpos[body], self.data.xmat[body]])

@@ -8,7 +8,7 @@ import numpy as np
 from vla.spec import Array
 from vla.tasks.libero.controller import REACH
 from vla.tasks.libero.grasps import LEAN, Grasp, parts
-from vla.tasks.libero.places import Place
+from vla.tasks.libero.places import LOOSE, Place
 from vla.tasks.libero.room import HAND, TIP, axes
 from vla.tasks.libero.situation import THIN, Situation
 
@@ -24,6 +24,7 @@ SWEEP = 0.08  # distance to the line along which a thing is carried within which
 SLOW = 0.012  # by which the hand is ahead of what it drags, or it slips [m]
 BACK = 0.5  # lean of a hand that pushes [rad]
 EMPTY = 0.01  # largest distance of the fingers at which nothing worth keeping is between them [m]
+RESTS = 0.12  # height over its place at which a thing is let go if it lies on something there [m]
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -63,7 +64,8 @@ def carry(at: Situation, thing: str, place: Place) -> Array:
             return command(at, at.hand + place.spot - origin, yaw, 1.0, lean)
     offset = place.spot - origin
     away = float(np.hypot(*offset[:2]))
-    if away < min(0.015, place.slack) and offset[2] > -0.012 and abs(place.turn) < TURNED:
+    down = offset[2] > -0.012 or (offset[2] > -RESTS and place.slack == LOOSE and at.rests(thing))
+    if away < min(0.015, place.slack) and down and abs(place.turn) < TURNED:
         return command(at, at.hand, yaw, -1.0, lean)
     away += 0.1 * abs(place.turn)
     lift = min(FUNNEL * away, CARRY) if away > 0.6 * place.slack else 0.0
