@@ -11,17 +11,18 @@ from vla.tasks.libero.room import CLEAR, clearance, far, turned
 from vla.tasks.libero.situation import Situation
 
 LOOSE = 0.02  # distance from a spot at which a thing may be lowered where there is room [m]
-TIGHT = 0.006  # the same where there is none [m]
+TIGHT = 0.009  # the same where there is none [m]
 MARGIN = 0.008  # between a thing and what stands about its place [m]
 ASIDE = 0.012  # between a thing and a drawer that is to be opened [m]
 SLIT = 0.008  # between a thing and what it passes [m]
 PUSHED = 0.06  # by which other things may be pushed by one that is dragged [m]
 SQUARE = 0.01  # edge of the squares in which one point stands for all that are over each other [m]
-STAY = 0.3  # cost per metre of a place from where the thing is carried: the choice stays the same
+STAY = 0.1  # cost per metre of a place from where the thing is carried: the choice stays the same
 FLOOR = 0.012  # height over the floor of a region of what is in the way there [m]
 THICK = 0.03  # largest height of what carries things over the middle of a flat region [m]
 GRID = np.stack(np.meshgrid(*[np.linspace(-0.8, 0.8, 5)] * 2), axis=-1).reshape(-1, 2)
 WAYS = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(16) * np.pi / 8])  # out from under a roof
+OBLIQUE = np.where(np.arange(len(WAYS)) % 4, 0.1, 0.0)  # costs of ways that are not along a wall [m]
 ROOFED = 0.05  # cost of a place wholly under a roof
 
 
@@ -98,13 +99,13 @@ def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
             hands = spots + turned(turn) @ (at.hand - origin)
             costs += np.maximum(0, CLEAR - clearance(hands, np.full(len(hands), at.yaw + turn), rest)) + far(at, hands)
         one = int(np.argmin(costs))
-        out = form.out(spots[one], rest) if roofs[one] else None
+        out = form.out(spots[one], rest, OBLIQUE) if roofs[one] else None
         slack = float(np.clip(gaps[one], TIGHT, LOOSE)) if out is None else SLIT
         options.append((float(gaps[one]), Place(spots[one], turn, slack, out)))
         if gaps[one] > 0:
             return options[-1][1]
     best = max(options, key=lambda option: option[0])
-    if best[0] > options[0][0] + MARGIN:
+    if best[0] > options[0][0] + MARGIN or extent[2] < THICK:
         return best[1]
     return replace(options[0][1], slack=LOOSE)  # it fits nowhere, so it lies on what is there
 
@@ -153,7 +154,7 @@ class _Form:
         over = rest[:, 2] > spots[0, 2] + self._height
         covered = (self._gaps(spots, _flat(rest[over])) < -MARGIN).sum(axis=1)
         gaps = self._gaps(spots, _flat(rest[~over]))
-        return gaps.min(axis=1, initial=1.0), (covered > 0) / 2 + covered / max(2 * int(covered.max(initial=0)), 1)
+        return gaps.min(axis=1, initial=1.0), (covered > 0) / 4 + covered / max(int(covered.max(initial=0)), 1)
 
     def out(
         self,

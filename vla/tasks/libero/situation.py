@@ -130,10 +130,11 @@ class Situation:
         return next((name for name, body in self.goal.bodies.items() if body in held and body in self._movable), None)
 
     def rests(self, thing: str) -> bool:
-        """Return whether a thing touches another one."""
-        root = self.goal.bodies[thing]
-        owners = self.goal.owner[self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]]
-        return bool(((owners == root).any(axis=1) & (owners > 0).all(axis=1) & (owners != root).any(axis=1)).any())
+        """Return whether a thing touches another one that can be moved."""
+        root, pairs = self.goal.bodies[thing], self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]
+        touching = self.goal.owner[pairs]
+        others = touching[(touching == root).any(axis=1)].ravel()
+        return bool(np.isin(others, list(self._movable - {root})).any())
 
     def _place(self, thing: str, body: int) -> list[Array]:
         """Return points (N, 3) on each geom of a body [m]; those of bodies that did not move are kept."""
