@@ -44,7 +44,7 @@ def disturbed(env: Any, random: np.random.Generator) -> np.ndarray:
     return qpos
 
 
-def measured(task: Any, seed: int) -> dict[str, np.ndarray]:
+def measured(task: Any, seed: int) -> dict[str, Any]:
     """Play and judge one task."""
     file = Path(get_libero_path("bddl_files")) / task.problem_folder / task.bddl_file
     outer = ControlEnv(str(file), has_offscreen_renderer=False, use_camera_obs=False, ignore_done=True, horizon=100000)

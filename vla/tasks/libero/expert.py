@@ -64,9 +64,12 @@ def decide(at: Situation) -> Array:
     parts = sorted(at.task.goal, key=lambda part: ORDER.index(part[0]))
     todo = [part for part in parts if not at.goal.holds(at.data, *part)]
     touched = at.touched()
-    if not todo or (touched is not None and all(at.subject(part[1]) != touched for part in todo)):
-        return command(at, at.hand, at.yaw, -1.0, at.lean)  # let go of what is where it should be
     held = touched if at.opening < HELD and at.gap > THIN else None
+    if not todo or (touched is not None and all(at.subject(part[1]) != touched for part in todo)):
+        done = next((part for part in parts if part[1] == held and part[0] == "in"), None)
+        if done is not None and todo and at.subject(done[2]).startswith(DRAWERS):
+            return _deliver(at, done[1], done[2], True)  # it counts as there, but it is not down yet
+        return command(at, at.hand, at.yaw, -1.0, at.lean)
     part = next((part for part in todo if held is not None and part[1] == held), todo[0])
     if part[0] in ("on", "in") and _shut(at, part[2]):
         if part[1] == held:

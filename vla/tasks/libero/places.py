@@ -11,15 +11,18 @@ from vla.tasks.libero.room import CLEAR, clearance, far, turned
 from vla.tasks.libero.situation import Situation
 
 LOOSE = 0.02  # distance from a spot at which a thing may be lowered where there is room [m]
-TIGHT = 0.006  # the same where there is none [m]
+TIGHT = 0.009  # the same where there is none [m]
 MARGIN = 0.008  # between a thing and what stands about its place [m]
 ASIDE = 0.012  # between a thing and a drawer that is to be opened [m]
 SLIT = 0.008  # between a thing and what it passes [m]
 PUSHED = 0.06  # by which other things may be pushed by one that is dragged [m]
+SQUARE = 0.01  # edge of the squares in which one point stands for all that are over each other [m]
+STAY = 0.1  # cost per metre of a place from where the thing is carried: the choice stays the same
 FLOOR = 0.012  # height over the floor of a region of what is in the way there [m]
 THICK = 0.03  # largest height of what carries things over the middle of a flat region [m]
 GRID = np.stack(np.meshgrid(*[np.linspace(-0.8, 0.8, 5)] * 2), axis=-1).reshape(-1, 2)
 WAYS = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(16) * np.pi / 8])  # out from under a roof
+OBLIQUE = np.where(np.arange(len(WAYS)) % 4, 0.1, 0.0)  # costs of ways that are not along a wall [m]
 ROOFED = 0.05  # cost of a place wholly under a roof
 
 
@@ -63,7 +66,7 @@ def way_out(at: Situation, thing: str, over: Array, held: bool, margin: float = 
     if not form.room(origin[None], over)[1][0]:
         return None
     starts = np.column_stack([origin[:2] + 0.02 * WAYS, np.full(len(WAYS), points[:, 2].max() - 0.02)])
-    gaps = clearance(starts, np.arctan2(WAYS[:, 1], WAYS[:, 0]), over)
+    gaps = clearance(starts, np.arctan2(WAYS[:, 1], WAYS[:, 0]), _flat(over))
     rest = at.others(thing, origin, 0.3)
     rest = rest[rest[:, 2] > points[:, 2].min() + FLOOR]
     return form.out(
@@ -86,23 +89,25 @@ def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
     rest = at.others(thing, middle, float(extent[:2].max()) + 0.15)
     rest = rest[rest[:, 2] > floor + FLOOR]
     away = 0.1 * np.linalg.norm(spots[:, :2] - middle[:2], axis=1)
-    best: tuple[float, Place] | None = None
+    options = []
     for turn in _turns(points):
         form = _Form(points, origin, turn)
         gaps, roofs = form.room(spots, rest)
         costs = away + 2 * np.maximum(0, MARGIN - gaps) + ROOFED * roofs
         if held:
+            costs += STAY * np.linalg.norm(spots[:, :2] - origin[:2], axis=1)
             hands = spots + turned(turn) @ (at.hand - origin)
             costs += np.maximum(0, CLEAR - clearance(hands, np.full(len(hands), at.yaw + turn), rest)) + far(at, hands)
         one = int(np.argmin(costs))
-        if best is None or costs[one] < best[0]:
-            slack = float(np.clip(gaps[one], TIGHT, LOOSE))
-            out = form.out(spots[one], rest) if roofs[one] else None
-            best = float(costs[one]), Place(spots[one], turn, slack if out is None else SLIT, out)
-        if gaps.max() > 0:
-            break  # it fits as it is
-    assert best is not None
-    return best[1]
+        out = form.out(spots[one], rest, OBLIQUE) if roofs[one] else None
+        slack = float(np.clip(gaps[one], TIGHT, LOOSE)) if out is None else SLIT
+        options.append((float(gaps[one]), Place(spots[one], turn, slack, out)))
+        if gaps[one] > 0:
+            return options[-1][1]
+    best = max(options, key=lambda option: option[0])
+    if best[0] > options[0][0] + MARGIN or extent[2] < THICK:
+        return best[1]
+    return replace(options[0][1], slack=LOOSE)  # it fits nowhere, so it lies on what is there
 
 
 def _floor(at: Situation, where: str, middle: Array, extent: Array) -> float:
@@ -139,16 +144,17 @@ class _Form:
     def _gaps(self, spots: Array, rest: Array) -> Array:
         """Return how far points (N, 3) are outside of the box at places (K, 3): (K, N) [m], negative inside."""
         offset = rest[None, :, :2] - spots[:, None, :2] - self._middle
-        return (np.abs(offset @ self._axes) - self._half).max(axis=2)
+        across = np.abs(offset @ self._axes) - self._half
+        return np.maximum(across[..., 0], across[..., 1])
 
     def room(self, spots: Array, rest: Array) -> tuple[Array, Array]:
         """Return the free room (K,) [m] about the box at places (K, 3), and the share (K,) of a roof over it."""
         if not len(rest):
             return np.ones(len(spots)), np.zeros(len(spots))
-        gaps = self._gaps(spots, rest)
         over = rest[:, 2] > spots[0, 2] + self._height
-        covered = (gaps[:, over] < -MARGIN).sum(axis=1)
-        return gaps[:, ~over].min(axis=1, initial=1.0), covered / max(int(covered.max(initial=0)), 1)
+        covered = (self._gaps(spots, _flat(rest[over])) < -MARGIN).sum(axis=1)
+        gaps = self._gaps(spots, _flat(rest[~over]))
+        return gaps.min(axis=1, initial=1.0), (covered > 0) / 4 + covered / max(int(covered.max(initial=0)), 1)
 
     def out(
         self,
@@ -169,14 +175,20 @@ class _Form:
             margin: the margin [m].
             most: by which it may push other things [m].
         """
-        over = rest[rest[:, 2] > spot[2] + self._height] if over is None else over
+        over = _flat(rest[rest[:, 2] > spot[2] + self._height] if over is None else over)
         distances = np.arange(0.02, 0.3, 0.02)
         ways = (distances[:, None, None] * WAYS).reshape(-1, 2)
         spots = spot + np.column_stack([ways, np.zeros(len(ways))])
-        beside = rest[rest[:, 2] <= spot[2] + self._height]
+        beside = _flat(rest[rest[:, 2] <= spot[2] + self._height])
         room = self._gaps(spots, beside).min(axis=1, initial=1.0).reshape(len(distances), -1)
         free = self._gaps(spots, over).min(axis=1, initial=1.0) > margin
         squeeze = np.maximum(0, np.maximum(SLIT - room, -np.minimum.accumulate(room, axis=0)))
         free &= (squeeze < most).ravel()
         total = np.where(free, (distances[:, None] + 3 * squeeze + np.broadcast_to(costs, len(WAYS))).ravel(), np.inf)
         return np.array([*ways[int(np.argmin(total))], 0.0]) if free.any() else None
+
+
+def _flat(points: Array) -> Array:
+    """Return one point in each little square of the horizontal plane of points (N, 3)."""
+    squares = np.rint(points[:, :2] / SQUARE).astype(int) @ (1, 1 << 20)
+    return points[np.unique(squares, return_index=True)[1]]

@@ -19,7 +19,9 @@ CUBE = 0.012  # edge of the cubes in which one point stands for all, where a thi
 HELD = -0.3  # largest commanded opening at which the fingers press
 SHUT = -0.99  # largest commanded opening at which the fingers press as much as they can
 THIN = 0.003  # least distance of fingers that hold something [m]
-WRIST = 2.5  # largest turn of the last joint either way, whose limit is 2.9 [rad]
+WRIST = 2.7  # largest turn of the last joint either way, whose limit is 2.9 [rad]
+SMALL = 0.2  # turn that is done wherever the last joint is [rad]
+SLANT = 0.3  # largest vertical component of the direction in which the fingers of such a hand close
 UPRIGHT = -0.6  # largest vertical component of where a hand that points down points
 
 
@@ -60,8 +62,8 @@ class Situation:
 
     @property
     def upright(self) -> bool:
-        """Whether the hand points down."""
-        return bool(self.rotation[2, 2] < UPRIGHT)
+        """Whether the hand points down, if leaning, and its fingers close horizontally."""
+        return bool(self.rotation[2, 2] < UPRIGHT and abs(self.rotation[2, 0]) < SLANT)
 
     def turn_to(self, yaw: float) -> float:
         """Return the rotation [rad] to a yaw: the fingers are alike, so half a turn more or less is the same.
@@ -70,7 +72,8 @@ class Situation:
         """
         turns = yaw - self.yaw + np.pi * np.arange(-3, 4)
         wrist = self.data.qpos[6] - turns
-        return float(min(zip(turns, wrist, strict=True), key=lambda one: (abs(one[1]) > WRIST, abs(one[0])))[0])
+        strained = (np.abs(wrist) > WRIST) & (np.abs(turns) > SMALL)
+        return float(turns[int(np.lexsort((np.abs(turns), strained))[0])])
 
     def origin(self, thing: str) -> Array:
         """Return the origin (3,) of a thing [m]."""
@@ -125,6 +128,13 @@ class Situation:
         shut = self.opening < SHUT and self.gap > THIN
         held = touched[0] | touched[1] if shut else touched[0] & touched[1]
         return next((name for name, body in self.goal.bodies.items() if body in held and body in self._movable), None)
+
+    def rests(self, thing: str) -> bool:
+        """Return whether a thing touches another one that can be moved."""
+        root, pairs = self.goal.bodies[thing], self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]
+        touching = self.goal.owner[pairs]
+        others = touching[(touching == root).any(axis=1)].ravel()
+        return bool(np.isin(others, list(self._movable - {root})).any())
 
     def _place(self, thing: str, body: int) -> list[Array]:
         """Return points (N, 3) on each geom of a body [m]; those of bodies that did not move are kept."""

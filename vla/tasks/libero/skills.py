@@ -7,10 +7,10 @@ import numpy as np
 
 from vla.spec import Array
 from vla.tasks.libero.controller import REACH
-from vla.tasks.libero.grasps import Grasp, parts
-from vla.tasks.libero.places import Place
+from vla.tasks.libero.grasps import LEAN, Grasp, parts
+from vla.tasks.libero.places import LOOSE, Place
 from vla.tasks.libero.room import HAND, TIP, axes
-from vla.tasks.libero.situation import HELD, THIN, Situation
+from vla.tasks.libero.situation import THIN, Situation
 
 GAIN = 3.0  # of the distance to go, in a command: less leaves the hand a centimetre away from where it is to be
 TURN_GAIN = 1.0  # of the rotation to go: more is unstable where the arm folds up
@@ -24,6 +24,7 @@ SWEEP = 0.08  # distance to the line along which a thing is carried within which
 SLOW = 0.012  # by which the hand is ahead of what it drags, or it slips [m]
 BACK = 0.5  # lean of a hand that pushes [rad]
 EMPTY = 0.01  # largest distance of the fingers at which nothing worth keeping is between them [m]
+RESTS = 0.12  # height over its place at which a thing is let go if it lies on something there [m]
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -49,9 +50,9 @@ def approach(at: Situation, grasp: Grasp, points: Array, thing: str, opening: fl
 
 def carry(at: Situation, thing: str, place: Place) -> Array:
     """Carry the held thing to a place, and let go of it there."""
-    origin, yaw = at.origin(thing), at.yaw + place.turn
+    origin, yaw, lean = at.origin(thing), at.yaw + place.turn, LEAN * round(at.lean / LEAN)
     if place.hidden is not None:
-        return command(at, at.hand + place.hidden + 0.01 * UP, yaw, 1.0, at.lean)
+        return command(at, at.hand + place.hidden + 0.01 * UP, yaw, 1.0, lean)
     if place.out is not None:
         way = place.out / np.linalg.norm(place.out)
         offset = origin - place.spot
@@ -60,16 +61,17 @@ def carry(at: Situation, thing: str, place: Place) -> Array:
         if aside > 0.02 or before > np.linalg.norm(place.out) + 0.03:
             place = Place(place.spot + place.out, place.turn, 0.0)
         elif before > 0.004:
-            return command(at, at.hand + place.spot - origin, yaw, 1.0, at.lean)
+            return command(at, at.hand + place.spot - origin, yaw, 1.0, lean)
     offset = place.spot - origin
     away = float(np.hypot(*offset[:2]))
-    if away < min(0.015, place.slack) and offset[2] > -0.012 and abs(place.turn) < TURNED:
-        return command(at, at.hand, yaw, -1.0, at.lean)
+    down = offset[2] > -0.012 or (offset[2] > -RESTS and place.slack == LOOSE and at.rests(thing))
+    if away < min(0.015, place.slack) and down and abs(place.turn) < TURNED:
+        return command(at, at.hand, yaw, -1.0, lean)
     away += 0.1 * abs(place.turn)
     lift = min(FUNNEL * away, CARRY) if away > 0.6 * place.slack else 0.0
     if away > place.slack:
         lift += max(0.0, _above(at, thing, place.spot))
-    return command(at, rising(at, at.hand + offset + lift * UP), yaw, 1.0, at.lean)
+    return command(at, rising(at, at.hand + offset + lift * UP), yaw, 1.0, lean)
 
 
 def alike(at: Situation, grasp: Grasp) -> Grasp:
@@ -143,7 +145,7 @@ def twist(at: Situation, thing: str) -> Array:
     moving = at.moving(joint)
     grasp = min(parts(moving, alone=False), key=lambda one: one[0] + 0.02 * abs(at.turn_to(one[1].yaw)))[1]
     grasp = Grasp(np.array([*at.data.xanchor[joint][:2], grasp.position[2]]), grasp.yaw)
-    holds = at.opening < HELD and at.gap > THIN and np.linalg.norm(at.hand - grasp.position) < 3 * NEAR
+    holds = at.opening < FIRM and at.gap > THIN and np.linalg.norm(at.hand - grasp.position) < 3 * NEAR
     if holds:
         return command(at, grasp.position, at.yaw + 0.4, 1.0)
     return approach(at, grasp, np.concatenate(moving), thing)
@@ -188,7 +190,8 @@ def withdraw(at: Situation) -> Array:
     near = at.others("", at.hand, 0.1)
     if len(near) and np.linalg.norm(near - at.hand, axis=1).min() < 0.09:
         return move(at, at.hand - 0.05 * at.rotation[:, 2], at.rotation, -1.0)
-    return command(at, at.hand + 0.03 * UP, 0.0, -1.0)
+    inwards = at.base - at.hand  # not to a stretched arm
+    return command(at, at.hand + np.array([*(0.05 * inwards[:2] / np.hypot(*inwards[:2])), 0.02]), 0.0, -1.0)
 
 
 def tops(at: Situation) -> float:
