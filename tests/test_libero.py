@@ -1,0 +1,200 @@
+"""LIBERO: its controller and judgements against robosuite's, its starts and pictures, and its planner."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from contextlib import closing
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from composing import composed
+
+from vla.config.experiment import Experiment
+from vla.io.errors import UserError
+from vla.spec import FIRST_SEED, Array, Observation
+from vla.tasks.libero import package, scene
+from vla.tasks.libero.controller import Controller
+from vla.tasks.libero.environment import Libero
+from vla.tasks.libero.expert import Planner
+from vla.tasks.libero.goal import Goal
+from vla.tasks.libero.package import SUITES, tasks_of
+from vla.tasks.libero.starts import Starts, set_start
+
+REFERENCE = Path(__file__).with_name("libero_reference.npz")  # of robosuite, by tools/libero/excerpt.py
+
+
+def world(*overrides: str) -> Libero:
+    """A world with small and plain pictures."""
+    sizes = {"image_size": "[48,48]", "detail.things": 300, "detail.rest": 100, "detail.texels": 32}
+    plain = [f"task.{name}={value}" for name, value in sizes.items()]
+    made = Experiment.of(composed("task=libero", *plain, *overrides)).make_environment()()
+    assert isinstance(made, Libero)
+    return made
+
+
+def reference(kind: str) -> dict[str, Array]:
+    """Return name of a task → array of a kind."""
+    names = {"object": "object", "spatial": "spatial", "goal": "goal", "10": "long"}
+    with np.load(REFERENCE) as content:
+        found = [key.split() for key in content if key.endswith(kind)]
+        parts = {name: name.removeprefix("libero_").split("_") for name, _ in found}
+        return {f"{names[suite]} {number}": content[f"{name} {kind}"] for name, (suite, number) in parts.items()}
+
+
+def opened(name: str) -> tuple[mujoco.MjModel, mujoco.MjData, Goal]:
+    """Return model, first official start and goal of a task such as "goal 3"."""
+    suite, number = name.split()
+    task = tasks_of(suite)[int(number)]
+    model = scene.load_scene(task.scene, (), None)
+    data = mujoco.MjData(model)
+    set_start(model, data, Starts(model, task).official(0))
+    return model, data, Goal(model, task.goal)
+
+
+def played(environment: Libero, seed: int, steps: int = 5) -> list[Observation]:
+    """What is seen in the first steps of an episode with random actions."""
+    random = np.random.default_rng(seed)
+    seen = [environment.reset(seed)]
+    for _ in range(steps):
+        seen.append(environment.step(random.uniform(environment.spec.low, environment.spec.high)))
+    return seen
+
+
+def same(one: list[Observation], other: list[Observation]) -> bool:
+    """Whether states, truth and pictures are the same, bit for bit."""
+    return all(
+        np.array_equal(a.state, b.state)
+        and all(np.array_equal(a.rgb[name], b.rgb[name]) for name in a.rgb)
+        and all(np.array_equal((a.truth or {})[name], (b.truth or {})[name]) for name in a.truth or {})
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+@pytest.mark.parametrize("name", ["object 3", "goal 9", "long 9"])
+def test_the_arm_moves_as_robosuites(name: str) -> None:
+    model, data, _ = opened(name)
+    controller, joints = Controller(model), []
+    for command in reference("commands")[name]:
+        controller.step(data, command)
+        joints.append(data.qpos[:7].copy())
+    assert np.abs(joints - reference("joints")[name]).max() < 1e-6
+
+
+def test_every_predicate_is_judged_as_by_libero() -> None:
+    seen = set()
+    for name, positions in reference("positions").items():
+        (model, data, goal), holds = opened(name), []
+        for one in positions:
+            data.qpos[:], data.qvel[:] = one, 0
+            mujoco.mj_forward(model, data)
+            holds.append([goal.holds(data, *part) for part in goal.parts])
+        assert (np.array(holds) == reference("holds")[name]).all(), name
+        seen |= {(part[0], value) for row in holds for part, value in zip(goal.parts, row, strict=True)}
+    assert seen == {(kind, value) for kind in ("on", "in", "open", "close", "turnon") for value in (True, False)}
+
+
+def test_an_episode_is_a_function_of_its_seed() -> None:
+    with closing(world("task.suite=goal")) as one:
+        first, between, again = played(one, 13), played(one, 20), played(one, 13)
+    with closing(world("task.suite=goal")) as other:
+        fresh = played(other, 13)
+    assert same(first, again)
+    assert same(first, fresh)
+    assert not np.array_equal(first[0].state, between[0].state)
+
+
+def test_demonstrations_never_start_where_policies_are_tested() -> None:
+    environment = world("task.suite=spatial", "task.tasks=[4]")
+    starts = Starts(opened("spatial 4")[0], tasks_of("spatial")[4])
+    official = np.array([starts.official(number).qpos for number in range(len(starts))])
+    assert len(np.unique(official, axis=0)) == len(official) == 50
+    drawn = np.array([starts.drawn(np.random.default_rng(seed)).qpos for seed in range(20)])
+    assert np.abs(drawn[:, None] - official).max(axis=2).min() > 1e-3
+    with environment.blind():
+        environment.reset(0)
+        assert environment.draws["start"]["official"] == -1
+        for turn in (0, 7, 50):
+            environment.reset(FIRST_SEED + turn)
+            assert environment.draws["start"]["official"] == turn % 50
+    environment.close()
+
+
+def test_all_suites_have_ten_tasks_and_sentences() -> None:
+    assert len(set(world().tasks)) == len({task.instruction for suite in SUITES for task in tasks_of(suite)}) == 40
+    assert world("task.suite=[goal,long]", "task.tasks=[1,2]").tasks == ("goal_1", "goal_2", "long_1", "long_2")
+
+
+def test_a_scene_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    name = tasks_of("object")[0].scene
+    first = scene.load_scene(name, (), None)
+    monkeypatch.setattr(scene, "_light", None)
+    assert np.array_equal(first.body_mass, scene.load_scene(name, (), None).body_mass)
+
+
+def test_pictures_are_mirrored_as_published() -> None:
+    stove = ["task.suite=goal", "task.tasks=[7]"]
+    with closing(world(*stove)) as one, closing(world(*stove, "task.mirror=false")) as other:
+        mirrored, plain = one.reset(0).rgb, other.reset(0).rgb
+    assert all(np.array_equal(mirrored[name], picture[:, ::-1]) for name, picture in plain.items())
+    assert all(picture.std() > 10 for picture in plain.values())
+
+
+def test_the_planner_turns_on_the_stove_and_its_burner_lights_up() -> None:
+    with closing(world("task.suite=goal", "task.tasks=[7]", "task.image_size=[96,96]")) as environment:
+        before = environment.reset(3)
+        after = _solved(environment, 3)
+    seen = [one.rgb["agentview"].astype(int) for one in (before, after)]
+    dark, lit = (int(((picture[..., 0] - picture[..., 1]) > 80).sum()) for picture in seen)
+    assert lit > dark + 20
+
+
+@pytest.mark.parametrize("name", ["goal 0", "object 3", "spatial 0"])  # a drawer, a bottle, a bowl by its rim
+def test_the_planner_solves(name: str) -> None:
+    suite, number = name.split()
+    with closing(world(f"task.suite={suite}", f"task.tasks=[{number}]")) as environment, environment.blind():
+        _solved(environment, 1)
+
+
+def _solved(environment: Libero, seed: int) -> Observation:
+    expert, other = Planner(spec=environment.spec), Planner(spec=environment.spec)
+    seen = environment.reset(seed)
+    while not environment.done:
+        seen = environment.step(expert.act(seen))
+    assert environment.outcome == "success"
+    assert np.array_equal(expert.act(seen), other.act(seen))  # which saw nothing of what was before
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["task.suite=libero"], "LIBERO has no suite 'libero': it has spatial, object, goal, long, and LIBERO-PRO"),
+        (["task.suite=spatial_new"], "LIBERO has no suite 'spatial_new'"),
+        (["task.suite=goal", "task.cameras=[wrist]"], "task.cameras names wrist; LIBERO has"),
+    ],
+)
+def test_bad_options_end_in_a_sentence(overrides: list[str], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        world(*overrides).reset(0)
+
+
+def test_wheels_that_are_missing_or_of_another_version_end_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    package.folders.cache_clear()
+    monkeypatch.setattr(package, "version", lambda name: "9.9")
+    with pytest.raises(UserError, match=r"needs robosuite 1.4.0, and 9.9 is installed: pip install --no-deps"):
+        package.folders()
+
+    def missing(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(package, "version", missing)
+    with pytest.raises(UserError, match="the wheel robosuite, which is not installed"):
+        package.folders()
+
+
+def test_states_of_another_scene_end_in_a_sentence() -> None:
+    with pytest.raises(UserError, match="they are of another scene"):
+        Starts(opened("goal 0")[0], tasks_of("long")[9])

@@ -1,0 +1,55 @@
+"""Compare `task=libero` with what reference.py wrote: `python compare.py OUT`, in the environment of `vla`.
+
+Prints, per task, the largest difference of the arm's joints and of all positions after the same commands, and how many
+judgements of the goal's predicates agree.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from vla.tasks.libero.controller import Controller
+from vla.tasks.libero.goal import Goal
+from vla.tasks.libero.package import tasks_of
+from vla.tasks.libero.scene import Detail, load_scene
+from vla.tasks.libero.starts import Starts, set_start
+
+SUITES = {"libero_spatial": "spatial", "libero_object": "object", "libero_goal": "goal", "libero_10": "long"}
+DETAIL = Detail(6000, 1500, 600, 256)  # of the pictures, which is to leave physics as it is
+
+
+def main() -> None:
+    """Compare every task of a folder."""
+    worst, agreed, judged = 0.0, 0, 0
+    for file in sorted(Path(sys.argv[1]).glob("*.npz")):
+        suite, _, number = file.stem.rpartition("_")
+        task, reference = tasks_of(SUITES[suite])[int(number)], np.load(file)
+        model = load_scene(task.scene, ["nothing"], DETAIL)
+        data, controller, goal = mujoco.MjData(model), Controller(model), Goal(model, task.goal)
+        set_start(model, data, Starts(model, task).official(0))
+        controller.reset()
+        joints = []
+        for command in reference["commands"]:
+            controller.step(data, command)
+            joints.append(data.qpos.copy())
+        difference = np.abs(np.array(joints) - reference["joints"])
+        holds = []
+        for positions in reference["positions"]:
+            data.qpos[:], data.qvel[:] = positions, 0
+            mujoco.mj_forward(model, data)
+            holds.append([goal.holds(data, *part) for part in task.goal])
+        same = np.array(holds) == reference["holds"]
+        worst, agreed, judged = max(worst, difference[:, :7].max()), agreed + same.sum(), judged + same.size
+        print(
+            f"{task.name:10} arm {difference[:, :7].max():.1e} rad, all {difference.max():.1e}; "
+            f"{same.sum()} of {same.size} judgements, {reference['holds'].mean(axis=0).round(2)} hold"
+        )
+    print(f"arm within {worst:.1e} rad; {agreed} of {judged} judgements agree")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,263 @@
+"""LIBERO as a `vla.spec.Environment`, under the protocol of LeRobot and openpi."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import mujoco
+import numpy as np
+from annotated_types import Ge, Le, MinLen, Predicate
+
+from vla.io.errors import UserError
+from vla.io.types import ImageSize, Names, Natural, unique
+from vla.parallel.limits import free_memory
+from vla.spec import FIRST_SEED, Array, Observation, Spec
+from vla.tasks.libero.controller import REACH, Controller
+from vla.tasks.libero.goal import Goal
+from vla.tasks.libero.package import ALL, SUITES, Task, tasks_of
+from vla.tasks.libero.scene import BURNER, VISIBLE, Detail, load_scene
+from vla.tasks.libero.starts import Starts, set_start
+from vla.tasks.rendering.renderer import Renderer, RendererFactory, Views
+from vla.tasks.world import World
+
+CONTROL_HZ = 20.0
+STATE = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z", "finger_1", "finger_2")
+ACTION = ("dx", "dy", "dz", "turn_x", "turn_y", "turn_z", "gripper")
+# Steps of an episode by suite, without those in which it settles: LeRobot's and openpi's limits.
+STEPS = {
+    "lerobot": {"spatial": 280, "object": 280, "goal": 300, "long": 520},
+    "openpi": {"spatial": 220, "object": 280, "goal": 300, "long": 520},
+}
+WAIT = np.array([0.0] * 6 + [-1.0])  # the command while things settle: stay, and open the gripper
+FREE = 0.25  # share of the memory that scenes leave free
+
+Numbers = Annotated[list[Annotated[int, Ge(0), Le(9)]], MinLen(1), Predicate(unique)]
+
+
+class Libero(World):
+    """Tasks of a Panda on a table, a floor or in a kitchen, one of them per episode: seeds take them in turn.
+
+    Success is the first step that LIBERO calls one; an episode ends with it, or when its steps are used up. The state
+    is the position of the grip and the rotation vector of the hand in the world's frame, and the fingers' positions. An
+    action is a displacement and a rotation vector of the hand, in the world's axes and relative to where it is, and the
+    gripper's opening; the controller reaches about a quarter of a displacement within a step.
+    """
+
+    def __init__(
+        self,
+        suite: Names | str,
+        tasks: Numbers | None,
+        renderer: RendererFactory,
+        image_size: ImageSize,
+        cameras: Names,
+        mirror: bool,
+        detail: Detail,
+        starts: Literal["by_seed", "official", "drawn"],
+        steps: Literal["lerobot", "openpi"],
+        settle: Natural,
+    ) -> None:
+        """Find the files; scenes are compiled when first played.
+
+        Args:
+            suite: a suite of LIBERO, "spatial", "object", "goal" or "long", or of LIBERO-PRO, such as "spatial_swap", a
+                list of these, or "all", the four of LIBERO.
+            tasks: numbers of the tasks in each suite; None: all ten.
+            renderer: renderer of the images.
+            image_size: height and width of every camera's images [px].
+            cameras: names of cameras, such as "agentview" and "robot0_eye_in_hand".
+            mirror: whether images are mirrored left to right, as those are that published policies were trained with.
+            detail: of meshes and textures.
+            starts: "official": the fifty states of the benchmark; "drawn": others, from the same regions; "by_seed":
+                official ones for the seeds of evaluations, drawn ones for all others.
+            steps: whose limits of an episode's steps.
+            settle: steps before the first observation, in which things come to rest.
+
+        Raises:
+            UserError: the wheels are missing, or there is no such suite.
+        """
+        super().__init__()
+        suites = SUITES if suite == "all" else [suite] if isinstance(suite, str) else suite
+        chosen = range(10) if tasks is None else tasks
+        self._tasks = [tasks_of(name)[number] for name in suites for number in chosen]
+        self.tasks = tuple(task.name for task in self._tasks)
+        self._starts_of, self._limits, self._settle, self._mirror = starts, STEPS[steps], settle, mirror
+        self._renderer, self._detail = renderer, detail
+        self.spec = Spec(
+            cameras=tuple(cameras),
+            image_size=(image_size[0], image_size[1]),
+            state=STATE,
+            state_units=("m",) * 3 + ("rad",) * 3 + ("m",) * 2,
+            action=ACTION,
+            units=("m",) * 3 + ("rad",) * 3 + ("1",),
+            low=(*(-REACH).tolist(), -1.0),
+            high=(*REACH.tolist(), 1.0),
+            control_hz=CONTROL_HZ,
+            truth=(("object", 3), ("goal", 3)),
+        )
+        self._scenes: dict[str, Scene] = {}
+        self._started: dict[str, tuple[Starts, Goal]] = {}
+
+    @property
+    def tool(self) -> Array:
+        """(3,) position of the grip in the world [m]."""
+        return self._scene.data.site_xpos[self._scene.controller.site].copy()
+
+    def task_of(self, seed: int) -> str:
+        """Return the task of the episode of `seed`."""
+        return self.tasks[seed % len(self.tasks)]
+
+    def reset(self, seed: int) -> Observation:
+        """Start the episode of `seed`."""
+        number = seed % len(self._tasks)
+        task = self._task = self._tasks[number]
+        self.task, self.done, self.outcome, self._taken = task.name, False, "timeout", 0
+        scene = self._scene = self._scene_of(task)
+        starts, self._goal = self._started_of(task, scene)
+        turn = (seed - FIRST_SEED) // len(self._tasks)
+        official = self._starts_of == "official" or (self._starts_of == "by_seed" and seed >= FIRST_SEED)
+        state = turn % len(starts) if official else None
+        start = starts.drawn(np.random.default_rng(seed)) if state is None else starts.official(state)
+        self.draws = {"start": {"official": -1 if state is None else state}}
+        set_start(scene.model, scene.data, start)
+        scene.changed = True
+        scene.controller.reset()
+        for _ in range(self._settle):
+            scene.controller.step(scene.data, WAIT)
+        return self._look()
+
+    def step(self, action: Array) -> Observation:
+        """Apply one (7,) action, clipped to the spec's bounds, for one control period."""
+        self._require_running()
+        self._scene.controller.step(self._scene.data, command_of(np.clip(action, self.spec.low, self.spec.high)))
+        self._taken += 1
+        if self._goal.reached(self._scene.data):
+            self.outcome = "success"
+        self.done = self.outcome == "success" or self._taken == self._limits[self._task.suite.partition("_")[0]]
+        return self._look()
+
+    def close(self) -> None:
+        """Free physics and GL."""
+        while self._scenes:
+            self._scenes.popitem()[1].close()
+
+    def _scene_of(self, task: Task) -> Scene:
+        """Return the scene of a task; where memory is scarce, replace the newest, as tasks take turns."""
+        if task.scene not in self._scenes:
+            if self._scenes and free_memory() < FREE:
+                self._scenes.popitem()[1].close()
+                self._started.clear()
+            self._scenes[task.scene] = Scene(task, self._renderer, self.spec, self._detail)
+        return self._scenes[task.scene]
+
+    def _started_of(self, task: Task, scene: Scene) -> tuple[Starts, Goal]:
+        if task.name not in self._started:
+            self._started[task.name] = Starts(scene.model, task), Goal(scene.model, task.goal)
+        return self._started[task.name]
+
+    def _look(self) -> Observation:
+        scene = self._scene
+        pictures = () if self._blind else scene.pictures(self._mirror)
+        subject, *_, place = [part for part in self._task.goal[0][1:] for _ in (0, 1)]
+        truth = {
+            "object": scene.position(subject),
+            "goal": scene.position(place),
+            "commanded_position": scene.data.site_xpos[scene.controller.site].copy(),
+            "task": np.array([ALL.index(self._task.suite), self._task.number]),
+            "positions": scene.data.qpos.copy(),
+            "fixtures": scene.fixtures(self._task),
+            "opening": np.array([scene.controller.opening]),
+        }
+        return Observation(
+            rgb=dict(zip(self.spec.cameras, pictures, strict=False)),
+            state=scene.state(),
+            instruction=self._task.instruction,
+            truth=truth,
+        )
+
+
+class Scene:
+    """Physics of a scene, its controller, and its renderer, which is made with the first picture."""
+
+    def __init__(self, task: Task, renderer: RendererFactory, spec: Spec, detail: Detail) -> None:
+        """Args: a task in it; renderer; the world's spec; detail of the pictures.
+
+        Raises:
+            UserError: there is no such camera.
+        """
+        self.model = model = load_scene(task.scene, [name for name, *_ in _things(task)], detail)
+        self.data = mujoco.MjData(model)
+        self.controller = Controller(model)
+        known = [model.camera(number).name for number in range(model.ncam)]
+        if unknown := [name for name in spec.cameras if name not in known]:
+            raise UserError(f"task.cameras names {', '.join(unknown)}; LIBERO has {', '.join(known)}")
+        model.mat_reflectance[:] = 0  # of the renderers none draws it
+        self._burners = [n for n in range(model.nsite) if model.site(n).name.endswith(BURNER)]
+        self._knobs = [
+            model.jnt_qposadr[model.joint(f"{model.site(n).name.removesuffix(BURNER)}_button").id]
+            for n in self._burners
+        ]
+        model.site_rgba[:, 3] = 0  # marks of regions, not to be seen
+        cameras = [known.index(name) for name in spec.cameras]
+        self._view = Views(cameras, *spec.image_size, geom_groups=(VISIBLE,), site_groups=tuple(range(6)))
+        self._factory = renderer
+        self._renderer: Renderer | None = None
+        self.changed = True
+        self._hand = model.body("robot0_right_hand").id
+        first = model.joint("gripper0_finger_joint1").qposadr[0]
+        self._fingers = slice(first, first + 2)
+
+    def position(self, thing: str) -> Array:
+        """Return the position (3,) of a thing or region in the world [m]."""
+        found = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, f"{thing}_main")
+        return (self.data.xpos[found] if found >= 0 else self.data.site(thing).xpos).copy()
+
+    def fixtures(self, task: Task) -> Array:
+        """Return position [m] and quaternion wxyz of the bodies of all fixtures (F, 7), in the order of the task."""
+        bodies = [self.model.body(one["body"]) for one in task.fixtures.values()]
+        return np.array([[*body.pos, *body.quat] for body in bodies]).reshape(-1, 7)
+
+    def state(self) -> Array:
+        """Return the state (8,) float32."""
+        quaternion = self.data.xquat[self._hand]
+        sine = float(np.linalg.norm(quaternion[1:]))
+        # The angle is 0…2 pi and not reduced, as in robosuite's quat2axisangle.
+        angle = 2 * np.arccos(np.clip(quaternion[0], -1, 1))
+        turn = quaternion[1:] / sine * angle if sine > 1e-9 else np.zeros(3)
+        grip = self.data.site_xpos[self.controller.site]
+        return np.concatenate([grip, turn, self.data.qpos[self._fingers]]).astype(np.float32)
+
+    def pictures(self, mirror: bool) -> Array:
+        """Draw every camera's picture (cameras, H, W, 3) uint8."""
+        for burner, knob in zip(self._burners, self._knobs, strict=True):
+            glows = float(self.data.qpos[knob] >= 0.5)
+            self.changed |= bool(self.model.site_rgba[burner, 3] != glows)
+            self.model.site_rgba[burner, 3] = glows
+        if self._renderer is None:
+            self._renderer = self._factory.open(self.model, self._view)
+        elif self.changed:
+            self._renderer.update()
+        self.changed = False
+        drawn = self._renderer.render(self.data)[0]
+        return drawn[:, :, ::-1] if mirror else drawn
+
+    def close(self) -> None:
+        """Free the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+def _things(task: Task) -> list[tuple[str, ...]]:
+    """Return (name,) of the movable things in a scene."""
+    return sorted({(part[1],) for part in task.initial if part[0] in ("on", "in") and part[1] not in task.fixtures})
+
+
+def command_of(action: Array) -> Array:
+    """Convert an action (7,), with 1 for an open gripper, to a command (7,) of -1…1, with 1 for a closed one."""
+    return np.array([*np.asarray(action[:6]) / REACH, -action[6]])
+
+
+def action_of(command: Array) -> Array:
+    """Convert a command (7,) of LIBERO to the action (7,) float32 that gives it, clipped to its bounds."""
+    clipped = np.clip(command, -1, 1)
+    return np.array([*(REACH * clipped[:6]), -clipped[6]], np.float32)

@@ -1,0 +1,109 @@
+"""A planner for LIBERO that knows the truth: a memoryless closed-loop controller of a few skills.
+
+Its action depends on the present state alone, so every action is a valid label for its state. What must be done next is
+read from the goal's predicates; where to grasp is computed from what collides, not from a table of things.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vla.io.errors import UserError
+from vla.spec import Array, Observation, Spec
+from vla.tasks.libero.environment import STATE, action_of
+from vla.tasks.libero.grasps import choose_grasp, room_of
+from vla.tasks.libero.package import ALL, tasks_of
+from vla.tasks.libero.places import in_the_way, place_of
+from vla.tasks.libero.situation import HELD, THIN, Situation
+from vla.tasks.libero.skills import approach, carry, command, drag, pull, push, twist, withdraw
+
+ORDER = ("open", "turnon", "on", "in", "close", "turnoff")  # in which parts of a goal are done
+DRAWERS = ("wooden_cabinet", "white_cabinet")  # what must be open for something to be put in
+NARROW = 0.006  # room about the hand below which a thing under something else is first dragged out [m]
+
+
+class Planner:
+    """Expert of all tasks of LIBERO."""
+
+    looks = False
+    memoryless = True
+
+    def __init__(self, *, spec: Spec) -> None:
+        """Args: the environment's spec.
+
+        Raises:
+            UserError: it is not that of LIBERO.
+        """
+        if spec.state != STATE:
+            raise UserError("expert=libero acts in task=libero only: choose the expert of this task")
+        self.info: dict[str, Any] = {}
+        self._known: dict[tuple[int, ...], Situation] = {}
+
+    def reset(self, instruction: str, seed: int) -> None:
+        """Do nothing: the planner has no state."""
+
+    def act(self, observation: Observation) -> Array:
+        """Return the (7,) float32 action.
+
+        Raises:
+            UserError: the observation lacks the simulator's truth.
+        """
+        truth = observation.truth
+        if truth is None:
+            raise UserError("expert=libero needs the simulator's truth, which this observation lacks")
+        key = tuple(int(number) for number in truth["task"])
+        if key not in self._known:
+            self._known[key] = Situation(tasks_of(ALL[key[0]])[key[1]])
+        situation = self._known[key]
+        situation.take(truth)
+        return action_of(decide(situation))
+
+
+def decide(at: Situation) -> Array:
+    """Return the command (7,) for a state."""
+    parts = sorted(at.task.goal, key=lambda part: ORDER.index(part[0]))
+    todo = [part for part in parts if not at.goal.holds(at.data, *part)]
+    touched = at.touched()
+    held = touched if at.opening < HELD and at.gap > THIN else None
+    if not todo or (touched is not None and all(at.subject(part[1]) != touched for part in todo)):
+        done = next((part for part in parts if part[1] == held and part[0] == "in"), None)
+        if done is not None and todo and at.subject(done[2]).startswith(DRAWERS):
+            return _deliver(at, done[1], done[2], True)  # it counts as there, but it is not down yet
+        return command(at, at.hand, at.yaw, -1.0, at.lean)
+    part = next((part for part in todo if held is not None and part[1] == held), todo[0])
+    if part[0] in ("on", "in") and _shut(at, part[2]):
+        if part[1] == held:
+            return command(at, at.hand, at.yaw, -1.0, at.lean)
+        aside = in_the_way(at, part[1], int(at.goal.joints(part[2])[0]))
+        if aside is not None and at.upright:
+            return drag(at, part[1], aside)
+        part = ("open", part[2])
+    if part[0] == "open":
+        return pull(at, part[1])
+    if not at.upright:
+        return withdraw(at)
+    if part[0] == "turnon":
+        return twist(at, part[1])
+    if part[0] == "close":
+        return push(at, part[1])
+    return _deliver(at, part[1], part[2], part[1] == held)
+
+
+def _deliver(at: Situation, thing: str, where: str, held: bool) -> Array:
+    """Bring a thing to where it is to be."""
+    place = place_of(at, thing, where, held)
+    if held:
+        return carry(at, thing, place)
+    grasp = choose_grasp(at, thing, place)
+    if place.hidden is not None and (grasp is None or room_of(at, thing, grasp) < NARROW):
+        return drag(at, thing, place.hidden)
+    if grasp is None:
+        return drag(at, thing, (place.spot - at.origin(thing)) * (1, 1, 0))
+    return approach(at, grasp, at.points(thing), thing)
+
+
+def _shut(at: Situation, place: str) -> bool:
+    """Return whether a place is in a drawer that must be opened first."""
+    if place in at.goal.bodies or not len(at.goal.joints(place)):
+        return False
+    return at.subject(place).startswith(DRAWERS) and not at.goal.holds(at.data, "open", place)

@@ -1,0 +1,84 @@
+"""LIBERO's test of success, from a state of MuJoCo alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from vla.spec import Array
+
+# Prefix of a fixture's name → its joint is open below the first number and closed above the second [m, rad]
+# (libero/envs/objects/articulated_objects.py).
+DOORS = {"wooden_cabinet": (-0.14, 0.0), "white_cabinet": (-0.14, 0.0), "microwave": (-1.3, -0.005)}
+STOVE_ON = 0.5  # turn of the knob [rad]
+STOVE_OFF = 0.005
+NEAR = 0.03  # largest distance from the middle of a thing to lie on [m]
+OVER = (-0.005, 0.10)  # height over the upper side of a region to lie on [m]
+SLACK = 0.01  # depth under the box of a region to lie in [m]
+
+
+class Goal:
+    """A conjunction of predicates on things: bodies named `THING_main`, or sites, the regions."""
+
+    def __init__(self, model: mujoco.MjModel, goal: Sequence[Sequence[str]]) -> None:
+        """Args: the model of a scene; predicates with their arguments, as in `Task.goal`."""
+        self._model, self.parts = model, [tuple(part) for part in goal]
+        names = [model.body(number).name for number in range(model.nbody)]
+        self.bodies = {name.removesuffix("_main"): n for n, name in enumerate(names) if name.endswith("_main")}
+        self.sites = {model.site(number).name: number for number in range(model.nsite)}
+        self.owner = np.zeros(model.nbody, int)  # body → body of the thing that it is part of, 0: of none
+        for number in range(1, model.nbody):
+            own = names[number].endswith("_main")
+            self.owner[number] = number if own else self.owner[model.body_parentid[number]]
+
+    def reached(self, data: mujoco.MjData) -> bool:
+        """Return whether all predicates hold."""
+        return all(self.holds(data, *part) for part in self.parts)
+
+    def holds(self, data: mujoco.MjData, predicate: str, thing: str, place: str = "") -> bool:
+        """Return whether one predicate holds."""
+        if predicate == "on":
+            return self._on(data, self.bodies[thing], place)
+        if predicate == "in":
+            return self._in(data, self.bodies[thing], place)
+        turns = data.qpos[self._model.jnt_qposadr[self.joints(thing)]]
+        if predicate == "turnon":
+            return bool((turns >= STOVE_ON).any())
+        if predicate == "turnoff":
+            return bool((turns < STOVE_OFF).all())
+        opened, closed = next(limits for name, limits in DOORS.items() if thing.startswith(name))
+        return bool((turns < opened).any() if predicate == "open" else (turns > closed).all())
+
+    def joints(self, thing: str) -> Array:
+        """Return the joints of a fixture, or of the one body, such as a drawer, that a region belongs to."""
+        bodies = self._model.jnt_bodyid
+        if thing in self.bodies:
+            return np.flatnonzero(self.owner[bodies] == self.bodies[thing])
+        return np.flatnonzero(bodies == self._model.site_bodyid[self.sites[thing]])
+
+    def _on(self, data: mujoco.MjData, body: int, place: str) -> bool:
+        if place in self.bodies:
+            support = self.bodies[place]
+            gap = data.xpos[body] - data.xpos[support]
+            return bool(gap[2] >= 0 and np.hypot(*gap[:2]) < NEAR) and self.touch(data, body, support)
+        site = self.sites[place]
+        size = self._model.site_size[site]
+        # LIBERO turns by the matrix of the site, where its transpose was meant.
+        gap = data.site_xmat[site].reshape(3, 3) @ (data.xpos[body] - data.site_xpos[site])
+        over = size[2] + OVER[0] < gap[2] < size[2] + OVER[1] and bool((np.abs(gap[:2]) < size[:2]).all())
+        owner = self.owner[self._model.site_bodyid[site]]  # 0: a part of the table, which needs no touch
+        return over and (owner == 0 or self.touch(data, body, owner))
+
+    def _in(self, data: mujoco.MjData, body: int, place: str) -> bool:
+        """Return whether the body's origin is in the region, wherever it is held."""
+        site = self.sites[place]
+        size = np.abs(data.site_xmat[site].reshape(3, 3) @ self._model.site_size[site])
+        gap = data.xpos[body] - data.site_xpos[site]
+        return bool((gap < size).all() and (gap > -size - np.array([0, 0, SLACK])).all())
+
+    def touch(self, data: mujoco.MjData, one: int, other: int) -> bool:
+        """Return whether two things, by their bodies, are in contact."""
+        pairs = self.owner[self._model.geom_bodyid[data.contact.geom[: data.ncon]]]
+        return bool((np.sort(pairs, axis=1) == sorted((one, other))).all(axis=1).any())

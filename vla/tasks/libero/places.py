@@ -1,0 +1,194 @@
+"""Where to put a thing down: free room on or in what the goal names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.libero.room import CLEAR, clearance, far, turned
+from vla.tasks.libero.situation import Situation
+
+LOOSE = 0.02  # distance from a spot at which a thing may be lowered where there is room [m]
+TIGHT = 0.009  # the same where there is none [m]
+MARGIN = 0.008  # between a thing and what stands about its place [m]
+ASIDE = 0.012  # between a thing and a drawer that is to be opened [m]
+SLIT = 0.008  # between a thing and what it passes [m]
+PUSHED = 0.06  # by which other things may be pushed by one that is dragged [m]
+SQUARE = 0.01  # edge of the squares in which one point stands for all that are over each other [m]
+STAY = 0.1  # cost per metre of a place from where the thing is carried: the choice stays the same
+FLOOR = 0.012  # height over the floor of a region of what is in the way there [m]
+THICK = 0.03  # largest height of what carries things over the middle of a flat region [m]
+GRID = np.stack(np.meshgrid(*[np.linspace(-0.8, 0.8, 5)] * 2), axis=-1).reshape(-1, 2)
+WAYS = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(16) * np.pi / 8])  # out from under a roof
+OBLIQUE = np.where(np.arange(len(WAYS)) % 4, 0.1, 0.0)  # costs of ways that are not along a wall [m]
+ROOFED = 0.05  # cost of a place wholly under a roof
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the origin of a thing is to be when it is let go."""
+
+    spot: Array  # (3,) [m]
+    turn: float = 0.0  # of the thing about the vertical, from how it is now [rad]
+    slack: float = LOOSE  # largest horizontal distance at which the thing may be lowered [m]
+    out: Array | None = None  # (3,) horizontal displacement from the spot to where no roof is over the thing [m]
+    hidden: Array | None = None  # the same from where the thing is
+
+
+def place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
+    """Return where to put a thing down on another one or on or in a region; `held`: the hand has it."""
+    place = _place_of(at, thing, where, held)
+    before = at.origin(thing) - place.spot
+    entering = place.out is not None and np.linalg.norm(before) < np.linalg.norm(place.out) + 0.03
+    return place if entering else replace(place, hidden=_hidden(at, thing, held))
+
+
+def _hidden(at: Situation, thing: str, held: bool) -> Array | None:
+    """Return the displacement (3,) [m] of a thing to where nothing is over it; None: nothing is."""
+    rest = at.others(thing, at.origin(thing), 0.3)
+    return way_out(at, thing, rest[rest[:, 2] > at.points(thing)[:, 2].max()], held)
+
+
+def in_the_way(at: Situation, thing: str, joint: int) -> Array | None:
+    """Return the displacement (3,) [m] of a thing to where a drawer does not come over it; None: it does not."""
+    moving = np.concatenate(at.moving(joint))
+    opening = np.linspace(0, at.model.jnt_range[joint, 0] - at.data.qpos[at.model.jnt_qposadr[joint]], 5)
+    rest = np.concatenate([moving + far * at.data.xaxis[joint] for far in opening])
+    return way_out(at, thing, rest[rest[:, 2] > at.points(thing)[:, 2].max()], False, ASIDE)
+
+
+def way_out(at: Situation, thing: str, over: Array, held: bool, margin: float = 2 * MARGIN) -> Array | None:
+    """Return the displacement (3,) [m] of a thing from under points (N, 3); None: it is not under them."""
+    points, origin = at.points(thing), at.origin(thing)
+    form = _Form(points, origin, 0.0)
+    if not form.room(origin[None], over)[1][0]:
+        return None
+    starts = np.column_stack([origin[:2] + 0.02 * WAYS, np.full(len(WAYS), points[:, 2].max() - 0.02)])
+    gaps = clearance(starts, np.arctan2(WAYS[:, 1], WAYS[:, 0]), _flat(over))
+    rest = at.others(thing, origin, 0.3)
+    rest = rest[rest[:, 2] > points[:, 2].min() + FLOOR]
+    return form.out(
+        origin, rest, 0.0 if held else 3 * np.maximum(0, CLEAR - gaps), over, margin, SLIT if held else PUSHED
+    )
+
+
+def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
+    points, origin = at.points(thing), at.origin(thing)
+    below = origin[2] - points[:, 2].min()
+    if where in at.goal.bodies:
+        support, middle = at.points(where), at.origin(where)
+        near = support[np.linalg.norm(support[:, :2] - middle[:2], axis=1) < 0.03]
+        return Place(np.array([*middle[:2], (near if len(near) else support)[:, 2].max() + below + 0.004]))
+    site = at.goal.sites[where]
+    middle, turn = at.data.site_xpos[site], at.data.site_xmat[site].reshape(3, 3)
+    extent = np.abs(turn) @ at.model.site_size[site]  # of the region along the axes of the world
+    floor = _floor(at, where, middle, extent)
+    spots = np.column_stack([middle[:2] + GRID * extent[:2], np.full(len(GRID), floor + below + 0.01)])
+    rest = at.others(thing, middle, float(extent[:2].max()) + 0.15)
+    rest = rest[rest[:, 2] > floor + FLOOR]
+    away = 0.1 * np.linalg.norm(spots[:, :2] - middle[:2], axis=1)
+    options = []
+    for turn in _turns(points):
+        form = _Form(points, origin, turn)
+        gaps, roofs = form.room(spots, rest)
+        costs = away + 2 * np.maximum(0, MARGIN - gaps) + ROOFED * roofs
+        if held:
+            costs += STAY * np.linalg.norm(spots[:, :2] - origin[:2], axis=1)
+            hands = spots + turned(turn) @ (at.hand - origin)
+            costs += np.maximum(0, CLEAR - clearance(hands, np.full(len(hands), at.yaw + turn), rest)) + far(at, hands)
+        one = int(np.argmin(costs))
+        out = form.out(spots[one], rest, OBLIQUE) if roofs[one] else None
+        slack = float(np.clip(gaps[one], TIGHT, LOOSE)) if out is None else SLIT
+        options.append((float(gaps[one]), Place(spots[one], turn, slack, out)))
+        if gaps[one] > 0:
+            return options[-1][1]
+    best = max(options, key=lambda option: option[0])
+    if best[0] > options[0][0] + MARGIN or extent[2] < THICK:
+        return best[1]
+    return replace(options[0][1], slack=LOOSE)  # it fits nowhere, so it lies on what is there
+
+
+def _floor(at: Situation, where: str, middle: Array, extent: Array) -> float:
+    """Return the height on which a thing in a region of half sizes (3,) about its middle (3,) stands [m]."""
+    owner = at.subject(where)
+    lowest = float(middle[2] - extent[2])
+    if not owner:
+        return lowest
+    points = at.points(owner)
+    under = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < 0.03
+    under &= points[:, 2] < middle[2] + max(0.0, THICK - extent[2])
+    return max(lowest, float(points[under, 2].max(initial=lowest)))
+
+
+def _turns(points: Array) -> tuple[float, ...]:
+    """Return turns [rad] worth trying: none, and those that lay a thing's long side along an axis of the world."""
+    _, directions = np.linalg.eigh(np.cov(points[:, :2].T))
+    angle = float(np.arctan2(directions[1, 1], directions[0, 1]))
+    turns = [(quarter - angle + np.pi / 2) % np.pi - np.pi / 2 for quarter in (0, np.pi / 2)]
+    return (0.0, *sorted(turns, key=abs))
+
+
+class _Form:
+    """The upright box about a thing, turned about its origin."""
+
+    def __init__(self, points: Array, origin: Array, turn: float) -> None:
+        _, directions = np.linalg.eigh(np.cov(points[:, :2].T))
+        inside = (points[:, :2] - origin[:2]) @ directions
+        low, high = inside.min(axis=0), inside.max(axis=0)
+        self._half, self._height = (high - low) / 2, points[:, 2].max() - origin[2]
+        self._axes = turned(turn)[:2, :2] @ directions
+        self._middle = self._axes @ (high + low) / 2
+
+    def _gaps(self, spots: Array, rest: Array) -> Array:
+        """Return how far points (N, 3) are outside of the box at places (K, 3): (K, N) [m], negative inside."""
+        offset = rest[None, :, :2] - spots[:, None, :2] - self._middle
+        across = np.abs(offset @ self._axes) - self._half
+        return np.maximum(across[..., 0], across[..., 1])
+
+    def room(self, spots: Array, rest: Array) -> tuple[Array, Array]:
+        """Return the free room (K,) [m] about the box at places (K, 3), and the share (K,) of a roof over it."""
+        if not len(rest):
+            return np.ones(len(spots)), np.zeros(len(spots))
+        over = rest[:, 2] > spots[0, 2] + self._height
+        covered = (self._gaps(spots, _flat(rest[over])) < -MARGIN).sum(axis=1)
+        gaps = self._gaps(spots, _flat(rest[~over]))
+        return gaps.min(axis=1, initial=1.0), (covered > 0) / 4 + covered / max(int(covered.max(initial=0)), 1)
+
+    def out(
+        self,
+        spot: Array,
+        rest: Array,
+        costs: Array | float = 0.0,
+        over: Array | None = None,
+        margin: float = 2 * MARGIN,
+        most: float = SLIT,
+    ) -> Array | None:
+        """Return the shortest horizontal displacement (3,) [m] from a spot to where nothing is beside or over it.
+
+        Args:
+            spot: (3,) of the thing's origin [m].
+            rest: points (N, 3) of what is in the way [m].
+            costs: of the ways (W,), added to the distances [m].
+            over: points (M, 3) to get away from by a margin; None: those of `rest` over the thing.
+            margin: the margin [m].
+            most: by which it may push other things [m].
+        """
+        over = _flat(rest[rest[:, 2] > spot[2] + self._height] if over is None else over)
+        distances = np.arange(0.02, 0.3, 0.02)
+        ways = (distances[:, None, None] * WAYS).reshape(-1, 2)
+        spots = spot + np.column_stack([ways, np.zeros(len(ways))])
+        beside = _flat(rest[rest[:, 2] <= spot[2] + self._height])
+        room = self._gaps(spots, beside).min(axis=1, initial=1.0).reshape(len(distances), -1)
+        free = self._gaps(spots, over).min(axis=1, initial=1.0) > margin
+        squeeze = np.maximum(0, np.maximum(SLIT - room, -np.minimum.accumulate(room, axis=0)))
+        free &= (squeeze < most).ravel()
+        total = np.where(free, (distances[:, None] + 3 * squeeze + np.broadcast_to(costs, len(WAYS))).ravel(), np.inf)
+        return np.array([*ways[int(np.argmin(total))], 0.0]) if free.any() else None
+
+
+def _flat(points: Array) -> Array:
+    """Return one point in each little square of the horizontal plane of points (N, 3)."""
+    squares = np.rint(points[:, :2] / SQUARE).astype(int) @ (1, 1 << 20)
+    return points[np.unique(squares, return_index=True)[1]]

@@ -1,0 +1,52 @@
+"""The room that the hand needs, and how far it reaches."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.libero.situation import Situation
+
+PALM = 0.030  # highest that a thing may stand above the point between the fingertips [m]
+TIP = 0.012  # of the fingers below that point [m]
+HAND = 0.10  # half of the width of the hand over the fingers [m]
+CLEAR = 0.045  # distance between a finger or the hand and anything else [m]
+ARM = (0.34, 0.75)  # horizontal distances from the base between which the arm neither folds up nor stretches [m]
+
+
+def clearance(spots: Array, yaws: Array, others: Array, leans: Array | float = 0.0) -> Array:
+    """Return horizontal distances (K,) [m], 1 at most, of points (N, 3) from the hand and what is between its fingers.
+
+    Args:
+        spots: (K, 3) of the point between the fingertips [m].
+        yaws: (K,) of the fingers [rad].
+        others: points (N, 3) of what is not to be touched [m].
+        leans: (K,) of the hand about the axis along which the fingers close [rad].
+    """
+    others = others[others[:, 2] > spots[:, 2].min() - 0.02]
+    offset = others[None, :, :2] - spots[:, None, :2]
+    sine, cosine = np.sin(yaws)[:, None], np.cos(yaws)[:, None]
+    closing = np.abs(offset[..., 1] * cosine - offset[..., 0] * sine)
+    above = others[:, 2] - spots[:, 2:]
+    shift = np.tan(np.broadcast_to(leans, len(spots)))[:, None] * np.maximum(above, 0)
+    along = np.abs(offset[..., 0] * cosine + offset[..., 1] * sine + shift)
+    hand = np.where(above > PALM, np.hypot(np.maximum(closing - HAND, 0), along), 1.0)
+    fingers = np.where(above > -0.02, np.hypot(np.maximum(closing - 0.05, 0), along), 1.0)
+    return np.minimum(hand, fingers).min(axis=1, initial=1.0)
+
+
+def far(at: Situation, spots: Array) -> Array:
+    """Return costs (K,) of places (K, 3) [m] for which the arm must stretch or fold up."""
+    distance = np.linalg.norm(spots[:, :2] - at.base[:2], axis=1)
+    return 3 * np.maximum(0, np.maximum(distance - ARM[1], ARM[0] - distance))
+
+
+def turned(angle: float) -> Array:
+    """Return the matrix (3, 3) of a rotation about the vertical [rad]."""
+    sine, cosine = np.sin(angle), np.cos(angle)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+
+
+def axes(yaw: float) -> tuple[Array, Array]:
+    """Return the horizontal directions (2,) in which the fingers close, and across it."""
+    return np.array([-np.sin(yaw), np.cos(yaw)]), np.array([np.cos(yaw), np.sin(yaw)])

@@ -1,0 +1,147 @@
+"""Scenes of LIBERO as models that are light enough to keep many of: the same physics, smaller meshes and textures.
+
+Every different scene is compiled once and kept in the user's cache folder. Only what nothing collides with becomes
+smaller, and LIBERO takes masses from the other geoms alone, so physics stays what it is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Annotated
+
+import mujoco
+import numpy as np
+from annotated_types import Ge
+from PIL import Image
+
+from vla.io.errors import UserError
+from vla.io.files import atomic_path
+from vla.spec import Array
+from vla.tasks.libero.package import scene_xml
+from vla.tasks.rendering.decimate import cache_folder, decimate
+
+VISIBLE = 1  # group of the geoms that are drawn; collisions are in group 0
+BURNER = "_burner"  # end of the name of a stove's glowing plate, a site
+WELD = 1e-6  # [m]
+
+Faces = Annotated[int, Ge(100)]
+
+
+@dataclass(frozen=True)
+class Detail:
+    """How much of a scene's pictures is kept.
+
+    Args of the config node `task.detail`.
+    """
+
+    things: Faces  # of a mesh of what tasks are about
+    robot: Faces  # of each of the robot's meshes
+    rest: Faces  # of each other mesh
+    texels: Annotated[int, Ge(16)]  # largest edge of a texture
+
+
+def load_scene(name: str, things: Collection[str], detail: Detail | None) -> mujoco.MjModel:
+    """Return the model of a scene; the first time it is compiled, which takes some seconds, and kept.
+
+    Args:
+        name: of the scene, as in `Task.scene`.
+        things: names of what tasks are about, whose meshes keep the most faces.
+        detail: of the pictures; None: of a model that only collides, a hundredth of the size.
+
+    Raises:
+        UserError: this MuJoCo cannot compile it.
+    """
+    asked = f"{name} {sorted(things)} {detail} {mujoco.__version__}"
+    path = cache_folder().parent / "libero" / f"{hashlib.sha256(asked.encode()).hexdigest()[:24]}.mjb"
+    if not path.is_file():
+        try:
+            model = _light(scene_xml(name), things, detail)
+        except ValueError as error:
+            raise UserError(f"MuJoCo {mujoco.__version__} cannot compile a scene of LIBERO: {error}") from error
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as draft:
+            mujoco.mj_saveModel(model, str(draft))
+    return mujoco.MjModel.from_binary_path(str(path))
+
+
+def _light(xml: str, things: Collection[str], detail: Detail | None) -> mujoco.MjModel:
+    if detail is None:
+        return _invisible(xml)
+    full, spec = mujoco.MjSpec.from_string(xml).compile(), mujoco.MjSpec.from_string(xml)
+    meshes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_MESH]
+    solid = {geom.meshname for geom in meshes if geom.contype or geom.conaffinity}
+    for name in {geom.meshname for geom in meshes} - solid:
+        most = detail.rest
+        if name.startswith(("robot0_", "gripper0_")):
+            most = detail.robot
+        if name.startswith(tuple(things)):
+            most = detail.things
+        if full.mesh_facenum[full.mesh(name).id] > most:
+            _thin(spec, full, name, most, [geom for geom in meshes if geom.meshname == name])
+    for texture in spec.textures:
+        if texture.file:
+            _shrink(full, texture, detail.texels)
+    return spec.compile()
+
+
+def _invisible(xml: str) -> mujoco.MjModel:
+    """Compile a scene without what is only drawn."""
+    spec = mujoco.MjSpec.from_string(xml)
+    for geom in list(spec.geoms):
+        if not (geom.contype or geom.conaffinity):
+            spec.delete(geom)
+    used = {geom.meshname for geom in spec.geoms}
+    for geom in spec.geoms:
+        geom.material = ""
+    for part in [*(mesh for mesh in spec.meshes if mesh.name not in used), *spec.materials, *spec.textures]:
+        spec.delete(part)
+    return spec.compile()
+
+
+def _thin(spec: mujoco.MjSpec, full: mujoco.MjModel, name: str, most: int, users: Collection[mujoco.MjsGeom]) -> None:
+    """Replace a mesh by one with fewer faces, in the frame of its file, which the geoms refer to."""
+    vertices, faces, texcoord = decimate(*_welded(full, full.mesh(name).id), most)
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, full.mesh_quat[full.mesh(name).id])
+    made = spec.add_mesh(name=f"{name}_light")
+    made.uservert = (vertices @ turn.reshape(3, 3).T + full.mesh_pos[full.mesh(name).id]).ravel()
+    made.userface = faces.ravel()
+    made.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # it may have holes
+    if full.mesh_texcoordadr[full.mesh(name).id] >= 0:
+        rows, places = np.unique(texcoord.reshape(-1, 2), axis=0, return_inverse=True)
+        made.usertexcoord, made.userfacetexcoord = rows.ravel(), places.ravel()
+    for geom in users:
+        geom.meshname = made.name
+    spec.delete(spec.mesh(name))
+
+
+def _welded(model: mujoco.MjModel, mesh: int) -> tuple[Array, Array, Array | None]:
+    """Return vertices, faces and corners' texture coordinates of a mesh, without vertices stored once per corner.
+
+    Thinning would otherwise take every edge for a border, and keep it.
+    """
+    first, start = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+    vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+    rows = slice(start, start + model.mesh_facenum[mesh])
+    _, kept, places = np.unique(np.rint(vertices / WELD), axis=0, return_index=True, return_inverse=True)
+    faces = places.ravel()[model.mesh_face[rows]]
+    if model.mesh_texcoordadr[mesh] < 0:
+        return vertices[kept], faces, None
+    return vertices[kept], faces, model.mesh_texcoord[model.mesh_texcoordadr[mesh] + model.mesh_facetexcoord[rows]]
+
+
+def _shrink(full: mujoco.MjModel, texture: mujoco.MjsTexture, texels: int) -> None:
+    """Give a texture its pixels instead of a file's, averaged to at most `texels` along an edge."""
+    number = full.texture(texture.name).id
+    height, width, channels = (int(of[number]) for of in (full.tex_height, full.tex_width, full.tex_nchannel))
+    start = int(full.tex_adr[number])
+    pixels = full.tex_data[start : start + height * width * channels].reshape(height, width, channels)
+    sides = np.split(pixels, 6 if height == 6 * width else 1)  # of a cube, one above the other
+    size = min(texels, width), min(texels, len(sides[0]))
+    small = np.concatenate([np.asarray(Image.fromarray(side).resize(size, Image.Resampling.BOX)) for side in sides])
+    texture.file, texture.gridsize = "", [1, 1]
+    texture.height, texture.width, texture.nchannel = *small.shape[:2], channels
+    texture.colorspace = mujoco.mjtColorSpace(int(full.tex_colorspace[number]))  # otherwise all colours turn pale
+    texture.data = small.tobytes()

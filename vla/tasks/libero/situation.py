@@ -1,0 +1,179 @@
+"""A state of a LIBERO task as its planner sees it: the hand, and points on the surface of everything that collides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import mujoco
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.libero.goal import Goal
+from vla.tasks.libero.package import Task
+from vla.tasks.libero.scene import load_scene
+from vla.tasks.libero.starts import Start, set_start
+
+SPACING = 0.015  # between points on surfaces [m]
+CUBE = 0.012  # edge of the cubes in which one point stands for all, where a thing is in the way [m]
+HELD = -0.3  # largest commanded opening at which the fingers press
+SHUT = -0.99  # largest commanded opening at which the fingers press as much as they can
+THIN = 0.003  # least distance of fingers that hold something [m]
+WRIST = 2.7  # largest turn of the last joint either way, whose limit is 2.9 [rad]
+SMALL = 0.2  # turn that is done wherever the last joint is [rad]
+SLANT = 0.3  # largest vertical component of the direction in which the fingers of such a hand close
+UPRIGHT = -0.6  # largest vertical component of where a hand that points down points
+
+
+class Situation:
+    """A task at one state."""
+
+    def __init__(self, task: Task) -> None:
+        """Args: the task."""
+        self.task, self.model = task, load_scene(task.scene, (), None)
+        self.data, self.goal = mujoco.MjData(self.model), Goal(self.model, task.goal)
+        self._shapes = {name: self._shape(root) for name, root in self.goal.bodies.items()}
+        self._sparse = {name: _sparse(list(shapes.values())) for name, shapes in self._shapes.items()}
+        self._placed: dict[int, tuple[Array, list[Array]]] = {}
+        self._site = self.model.site("gripper0_grip_site").id
+        self.base = self.model.body("robot0_base").pos.copy()  # of the arm (3,) [m]
+        names = {self.model.body(number).name: number for number in range(self.model.nbody)}
+        free = self.model.jnt_bodyid[self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+        self._movable = set(self.goal.owner[free].tolist())
+        self._fingers = [
+            [names[name] for name in (f"gripper0_{side}finger", f"gripper0_finger_joint{number}_tip") if name in names]
+            for side, number in (("left", 1), ("right", 2))
+        ]
+
+    def take(self, truth: dict[str, Array]) -> None:
+        """Take over a state from the simulator's truth."""
+        bodies = [one["body"] for one in self.task.fixtures.values()]
+        poses = {body: (pose[:3], pose[3:]) for body, pose in zip(bodies, truth["fixtures"], strict=True)}
+        set_start(self.model, self.data, Start(truth["positions"], poses))
+        self.opening = float(truth["opening"][0])  # commanded, 1 open and -1 closed
+        self.gap = float(self.data.qpos[7] - self.data.qpos[8])  # between the fingers [m]
+        self.hand = self.data.site_xpos[self._site].copy()  # of the point between the fingertips (3,) [m]
+        self.rotation = self.data.site_xmat[self._site].reshape(3, 3).copy()  # columns: closing, across, ahead
+        closing, across, ahead = self.rotation.T
+        self.yaw = float(np.arctan2(-closing[0], closing[1] if self.upright else across[0]))
+        self.lean = float(np.arctan2(ahead[:2] @ (np.cos(self.yaw), np.sin(self.yaw)), -ahead[2]))
+        self.__dict__.pop("rest", None)
+        self._known: dict[str, Array] = {}
+
+    @property
+    def upright(self) -> bool:
+        """Whether the hand points down, if leaning, and its fingers close horizontally."""
+        return bool(self.rotation[2, 2] < UPRIGHT and abs(self.rotation[2, 0]) < SLANT)
+
+    def turn_to(self, yaw: float) -> float:
+        """Return the rotation [rad] to a yaw: the fingers are alike, so half a turn more or less is the same.
+
+        The last joint turns against the yaw and must stay off its limits.
+        """
+        turns = yaw - self.yaw + np.pi * np.arange(-3, 4)
+        wrist = self.data.qpos[6] - turns
+        strained = (np.abs(wrist) > WRIST) & (np.abs(turns) > SMALL)
+        return float(turns[int(np.lexsort((np.abs(turns), strained))[0])])
+
+    def origin(self, thing: str) -> Array:
+        """Return the origin (3,) of a thing [m]."""
+        return self.data.xpos[self.goal.bodies[thing]]
+
+    def pieces(self, thing: str, body: int | None = None) -> list[Array]:
+        """Return points (N, 3) on each geom of a thing, or of one of its bodies [m]."""
+        shapes = self._shapes[thing]
+        return [points for number in ([body] if body is not None else shapes) for points in self._place(thing, number)]
+
+    def points(self, thing: str) -> Array:
+        """Return points (N, 3) on the surface of a thing [m]."""
+        if thing not in self._known:
+            self._known[thing] = np.concatenate(self.pieces(thing))
+        return self._known[thing]
+
+    def moving(self, joint: int) -> list[Array]:
+        """Return points (N, 3) on each geom of the body that a joint moves [m]."""
+        body = int(self.model.jnt_bodyid[joint])
+        thing = next(name for name, root in self.goal.bodies.items() if root == self.goal.owner[body])
+        return self.pieces(thing, body)
+
+    def others(self, thing: str, middle: Array, radius: float) -> Array:
+        """Return points (N, 3) on all but one thing, in a square of half width `radius` about `middle` (2,) [m]."""
+        points, owners = self.rest
+        near = (np.abs(points[:, :2] - middle[:2]) < radius).all(axis=1)
+        near &= owners != self.goal.bodies.get(thing, -1)
+        return points[near]
+
+    @cached_property
+    def rest(self) -> tuple[Array, Array]:
+        """Points (N, 3) on all things [m], and the bodies (N,) that they are of."""
+        points = [self.points(thing)[self._sparse[thing]] for thing in self._shapes]
+        owners = [np.full(len(some), body) for some, body in zip(points, self.goal.bodies.values(), strict=True)]
+        return np.concatenate(points), np.concatenate(owners)
+
+    def subject(self, name: str) -> str:
+        """Return the thing that a name is of: itself, or what a region belongs to."""
+        if name in self.goal.bodies:
+            return name
+        owner = self.goal.owner[self.model.site_bodyid[self.goal.sites[name]]]
+        return next((thing for thing, root in self.goal.bodies.items() if root == owner), "")
+
+    def touched(self) -> str | None:
+        """Return the movable thing that both fingers touch, or one of them when they are closed and yet apart."""
+        bodies = self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]
+        touched = []
+        for fingers in self._fingers:
+            mine = np.isin(bodies, fingers)
+            one = mine.sum(axis=1) == 1
+            touched.append(set(self.goal.owner[bodies[one][~mine[one]]].tolist()))
+        shut = self.opening < SHUT and self.gap > THIN
+        held = touched[0] | touched[1] if shut else touched[0] & touched[1]
+        return next((name for name, body in self.goal.bodies.items() if body in held and body in self._movable), None)
+
+    def rests(self, thing: str) -> bool:
+        """Return whether a thing touches another one that can be moved."""
+        root, pairs = self.goal.bodies[thing], self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]
+        touching = self.goal.owner[pairs]
+        others = touching[(touching == root).any(axis=1)].ravel()
+        return bool(np.isin(others, list(self._movable - {root})).any())
+
+    def _place(self, thing: str, body: int) -> list[Array]:
+        """Return points (N, 3) on each geom of a body [m]; those of bodies that did not move are kept."""
+        pose = np.concatenate([self.data.xpos[body], self.data.xmat[body]])
+        if body not in self._placed or not np.array_equal(self._placed[body][0], pose):
+            turn = pose[3:].reshape(3, 3).T
+            self._placed[body] = pose, [local @ turn + pose[:3] for local in self._shapes[thing].get(body, [])]
+        return self._placed[body][1]
+
+    def _shape(self, root: int) -> dict[int, list[Array]]:
+        """Return body → points (N, 3) on each geom, in its frame, of a body and those that hang on it."""
+        shapes: dict[int, list[Array]] = {}
+        model = self.model
+        for geom in range(model.ngeom):
+            body = int(model.geom_bodyid[geom])
+            if self.goal.owner[body] != root:
+                continue
+            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+                first = model.mesh_vertadr[model.geom_dataid[geom]]
+                points = model.mesh_vert[first : first + model.mesh_vertnum[model.geom_dataid[geom]]]
+            else:
+                round_ = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER
+                points = _surface(model.geom_size[geom][[0, 0, 1]] if round_ else model.geom_size[geom])
+            turn = np.empty(9)
+            mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+            shapes.setdefault(body, []).append(points @ turn.reshape(3, 3).T + model.geom_pos[geom])
+        return shapes
+
+
+def _sparse(shapes: Sequence[Sequence[Array]]) -> Array:
+    """Return rows of one point in each little cube of the points of bodies' geoms, one after the other."""
+    bodies = [np.full(sum(map(len, geoms)), body) for body, geoms in enumerate(shapes)]
+    points = np.concatenate([points for geoms in shapes for points in geoms])
+    cubes = np.column_stack([np.concatenate(bodies), np.rint(points / CUBE)])
+    return np.unique(cubes, axis=0, return_index=True)[1]
+
+
+def _surface(size: Array) -> Array:
+    """Return points (N, 3) on the faces of a box of half sizes (3,), at most `SPACING` apart [m]."""
+    axes = [np.linspace(-half, half, 2 + int(2 * half / SPACING)) for half in size]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return grid[(np.abs(np.abs(grid) - size) < 1e-9).any(axis=1)]

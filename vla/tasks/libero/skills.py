@@ -1,0 +1,231 @@
+"""What LIBERO's planner can do: commands (7,) for one step of a skill, from the present state alone."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from vla.spec import Array
+from vla.tasks.libero.controller import REACH
+from vla.tasks.libero.grasps import LEAN, Grasp, parts
+from vla.tasks.libero.places import LOOSE, Place
+from vla.tasks.libero.room import HAND, TIP, axes
+from vla.tasks.libero.situation import THIN, Situation
+
+GAIN = 3.0  # of the distance to go, in a command: less leaves the hand a centimetre away from where it is to be
+TURN_GAIN = 1.0  # of the rotation to go: more is unstable where the arm folds up
+HOVER = 0.08  # height over a thing at which it is approached [m]
+NEAR, LEVEL, TURNED = 0.008, 0.008, 0.12  # tolerances of a grasp: across [m], in height [m], in yaw [rad]
+FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approaches come from above
+MARGIN = 0.015  # height of open fingers over what they must not touch [m]
+FIRM = -0.9  # commanded opening at which they press as much as they can
+CARRY = 0.05  # height over all that is on the way [m]
+SWEEP = 0.08  # distance to the line along which a thing is carried within which it must be higher [m]
+SLOW = 0.012  # by which the hand is ahead of what it drags, or it slips [m]
+BACK = 0.5  # lean of a hand that pushes [rad]
+EMPTY = 0.01  # largest distance of the fingers at which nothing worth keeping is between them [m]
+RESTS = 0.12  # height over its place at which a thing is let go if it lies on something there [m]
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def approach(at: Situation, grasp: Grasp, points: Array, thing: str, opening: float = -1.0) -> Array:
+    """Move to a grasp of points (N, 3) of a thing from above, along the hand, and close the fingers there."""
+    grasp = alike(at, grasp)
+    slope = np.array([*(-np.tan(grasp.lean) * axes(grasp.yaw)[1]), 1.0])  # of the line on which the hand comes
+    height = at.hand[2] - grasp.position[2]
+    away = float(np.hypot(*(grasp.position + max(height, 0.0) * slope - at.hand)[:2]))
+    turn = max(abs(at.turn_to(grasp.yaw)), abs(at.lean - grasp.lean))
+    there = away < NEAR and turn < TURNED
+    if there and abs(height) < LEVEL:
+        return command(at, grasp.position, grasp.yaw, 1.0, grasp.lean)
+    # Until it is aligned, the hand stays above all that its fingers could come down on.
+    beside = at.others(thing, grasp.position, HAND)[:, 2]
+    over = max(points[:, 2].max(), beside.max(initial=-np.inf)) + TIP + MARGIN
+    sinking = at.hand[2] < over - 0.01 and away < 1.6 * NEAR and turn < 1.6 * TURNED
+    target = grasp.position.copy()
+    if (opening < 0 and at.opening < 0.5) or not (there or sinking):
+        target = target + (over + min(max(away - NEAR, 0.0) * FUNNEL, HOVER) - target[2]) * slope
+    return command(at, rising(at, target), grasp.yaw, opening, grasp.lean)
+
+
+def carry(at: Situation, thing: str, place: Place) -> Array:
+    """Carry the held thing to a place, and let go of it there."""
+    origin, yaw, lean = at.origin(thing), at.yaw + place.turn, LEAN * round(at.lean / LEAN)
+    if place.hidden is not None:
+        return command(at, at.hand + place.hidden + 0.01 * UP, yaw, 1.0, lean)
+    if place.out is not None:
+        way = place.out / np.linalg.norm(place.out)
+        offset = origin - place.spot
+        before = float(offset @ way)
+        aside = float(np.linalg.norm(offset - before * way))
+        if aside > 0.02 or before > np.linalg.norm(place.out) + 0.03:
+            place = Place(place.spot + place.out, place.turn, 0.0)
+        elif before > 0.004:
+            return command(at, at.hand + place.spot - origin, yaw, 1.0, lean)
+    offset = place.spot - origin
+    away = float(np.hypot(*offset[:2]))
+    down = offset[2] > -0.012 or (offset[2] > -RESTS and place.slack == LOOSE and at.rests(thing))
+    if away < min(0.015, place.slack) and down and abs(place.turn) < TURNED:
+        return command(at, at.hand, yaw, -1.0, lean)
+    away += 0.1 * abs(place.turn)
+    lift = min(FUNNEL * away, CARRY) if away > 0.6 * place.slack else 0.0
+    if away > place.slack:
+        lift += max(0.0, _above(at, thing, place.spot))
+    return command(at, rising(at, at.hand + offset + lift * UP), yaw, 1.0, lean)
+
+
+def alike(at: Situation, grasp: Grasp) -> Grasp:
+    """Return the grasp with the same fingers in the same places that the hand reaches by the smallest turn."""
+    turn = at.turn_to(grasp.yaw)
+    same = np.cos(at.yaw + turn - grasp.yaw) > 0
+    return Grasp(grasp.position, at.yaw + turn, grasp.lean if same else -grasp.lean)
+
+
+def _above(at: Situation, thing: str, spot: Array) -> float:
+    """Return by how much a thing must be higher than its spot to pass over all between it and the spot [m]."""
+    origin = at.origin(thing)
+    lowest = at.points(thing)[:, 2].min() - origin[2]
+    way = spot[:2] - origin[:2]
+    length = float(np.hypot(*way)) + 1e-9
+    rest = at.others(thing, (spot + origin) / 2, length / 2 + SWEEP)
+    along = np.clip((rest[:, :2] - origin[:2]) @ way / length, 0, length)
+    beside = np.linalg.norm(rest[:, :2] - origin[:2] - along[:, None] * way / length, axis=1)
+    return float(rest[beside < SWEEP, 2].max(initial=-np.inf) - (spot[2] + lowest))
+
+
+def drag(at: Situation, thing: str, displacement: Array) -> Array:
+    """Move a hollow thing that cannot be grasped by (3,) [m]: closed fingers inside press its wall."""
+    points, origin = at.points(thing), at.origin(thing)
+    way = displacement / np.linalg.norm(displacement)
+    radius = float(np.ptp(points[:, :2], axis=0).min()) / 2
+    steps = origin + np.linspace(0.45, 0.0, 6)[:, None] * radius * way  # the farther out, the higher the bottom is
+    floors = np.array([_under(points, step) for step in steps])
+    flat = floors <= floors[-1] + 0.35 * (points[:, 2].max() - floors[-1])
+    spot = np.array([*steps[int(np.argmax(flat))][:2], floors[int(np.argmax(flat))] + TIP])
+    inside = np.linalg.norm((at.hand - origin)[:2]) < 0.8 * radius
+    yaw = float(np.arctan2(way[1], way[0]))
+    if inside and at.hand[2] < spot[2] + 0.006:
+        target = at.hand + min(SLOW, float(np.linalg.norm(displacement))) * way
+        return command(at, np.array([*target[:2], spot[2] - 0.005]), yaw, 1.0)
+    return approach(at, Grasp(spot, yaw), points, thing, closing(at, float(points[:, 2].max())))
+
+
+def _under(points: Array, spot: Array) -> float:
+    """Return the height of points (N, 3) at a spot (3,) [m]."""
+    distance = np.linalg.norm(points[:, :2] - spot[:2], axis=1)
+    return float(points[distance < max(0.012, float(distance.min())), 2].max(initial=points[:, 2].min()))
+
+
+def pull(at: Situation, place: str) -> Array:
+    """Open a drawer by its handle: the hand comes from the front, one finger over the bar and one under it."""
+    joint = int(at.goal.joints(place)[0])
+    way = -at.data.xaxis[joint]  # openings are negative
+    bar = max(at.moving(joint), key=lambda points: float((points @ way).max()))
+    middle = (bar.max(axis=0) + bar.min(axis=0)) / 2 - 0.006 * way
+    turns = [np.stack([up, np.cross(-way, up), -way], axis=1) for up in (UP, -UP)]  # the fingers are alike
+    rotation = min(turns, key=lambda turn: float(np.linalg.norm(_turn(at, turn))))
+    offset = at.hand - middle
+    before = float(offset @ way)
+    aside, wrong = float(np.linalg.norm(offset - before * way)), float(np.linalg.norm(_turn(at, rotation)))
+    if aside < 1.5 * NEAR and wrong < 2 * TURNED and abs(before) < 2 * LEVEL:
+        grips = at.opening < FIRM and at.gap > THIN
+        return move(at, middle + (0.012 if grips else 0.0) * way, rotation, 1.0)  # slowly, or the fingers slip
+    if aside < 2 * NEAR and wrong < 2 * TURNED and at.opening > 0.9:
+        return move(at, middle, rotation, -1.0)
+    if at.upright and at.hand[2] < middle[2] - 0.03:
+        return command(at, np.array([*at.hand[:2], middle[2]]), 0.0, -1.0)
+    if before < 0.09 and at.hand[2] < tops(at) and wrong > 0.5:
+        return move(at, at.hand + 0.05 * UP, rotation, -1.0)
+    return move(at, middle + 0.11 * way, rotation, -1.0)
+
+
+def twist(at: Situation, thing: str) -> Array:
+    """Turn a knob: grasp it from above across its narrow side, and turn the hand."""
+    joint = int(at.goal.joints(thing)[0])
+    moving = at.moving(joint)
+    grasp = min(parts(moving, alone=False), key=lambda one: one[0] + 0.02 * abs(at.turn_to(one[1].yaw)))[1]
+    grasp = Grasp(np.array([*at.data.xanchor[joint][:2], grasp.position[2]]), grasp.yaw)
+    holds = at.opening < FIRM and at.gap > THIN and np.linalg.norm(at.hand - grasp.position) < 3 * NEAR
+    if holds:
+        return command(at, grasp.position, at.yaw + 0.4, 1.0)
+    return approach(at, grasp, np.concatenate(moving), thing)
+
+
+def push(at: Situation, thing: str) -> Array:
+    """Close a drawer or a door: push it, from outside, with closed fingers."""
+    joint = int(at.goal.joints(thing)[0])
+    points, axis = np.concatenate(at.moving(joint)), at.data.xaxis[joint]
+    ahead = axis
+    if at.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+        arms = points - at.data.xanchor[joint]
+        arms -= np.outer(arms @ axis, axis)
+        far = np.linalg.norm(arms, axis=1) / np.linalg.norm(arms, axis=1).max()
+        middle = (far > 0.5) & (far < 0.7)  # nearer to the hinge it is heavy, farther out the arm must stretch
+        points, ahead = points[middle], np.cross(axis, arms[middle].mean(axis=0))
+        ahead = ahead / np.linalg.norm(ahead)
+    depth = points @ ahead
+    face = points[depth < depth.min() + 0.012]
+    contact = np.array([*face[:, :2].mean(axis=0), max(face[:, 2].max() - 0.02, face[:, 2].mean())])
+    offset = at.hand - contact
+    before = float(offset @ ahead)
+    aside = float(np.linalg.norm((offset - before * ahead)[:2]))
+    # The fingers' broad side pushes, and the hand leans back, so that the arm stays off what is over a drawer.
+    pose = alike(at, Grasp(contact, float(np.arctan2(ahead[1], ahead[0])), BACK))
+    if -0.06 < before < 0.02 and aside < 0.03 and abs(offset[2]) < 0.03:
+        return command(at, contact + 0.05 * ahead, pose.yaw, 1.0, pose.lean)
+    grip = closing(at, tops(at))
+    start = contact - 0.045 * ahead
+    if np.linalg.norm((at.hand - start)[:2]) > 0.012:
+        start[2] = max(tops(at), contact[2]) + 0.04
+    return command(at, rising(at, start), pose.yaw, grip, pose.lean)
+
+
+def closing(at: Situation, top: float) -> float:
+    """Return the gripper's command that closes it, but not on what is between the fingers, below a height [m]."""
+    return 1.0 if at.gap < EMPTY or at.hand[2] > top + TIP else -1.0
+
+
+def withdraw(at: Situation) -> Array:
+    """Move a hand that does not point down away from where it points, then let it point down."""
+    near = at.others("", at.hand, 0.1)
+    if len(near) and np.linalg.norm(near - at.hand, axis=1).min() < 0.09:
+        return move(at, at.hand - 0.05 * at.rotation[:, 2], at.rotation, -1.0)
+    inwards = at.base - at.hand  # not to a stretched arm
+    return command(at, at.hand + np.array([*(0.05 * inwards[:2] / np.hypot(*inwards[:2])), 0.02]), 0.0, -1.0)
+
+
+def tops(at: Situation) -> float:
+    """Return the height of what stands near the hand [m]."""
+    return float(at.others("", at.hand, HAND + 0.05)[:, 2].max(initial=-np.inf))
+
+
+def rising(at: Situation, target: Array) -> Array:
+    """Reduce the motion across while the hand has to rise, so that it hits nothing."""
+    rise = target[2] - at.hand[2]
+    if rise > 0.01:
+        target = np.array([*(at.hand[:2] + (target[:2] - at.hand[:2]) * 0.02 / (0.02 + rise)), target[2]])
+    return target
+
+
+def command(at: Situation, target: Array, yaw: float, grip: float, lean: float = 0.0) -> Array:
+    """Return the command that moves the hand, pointing down, towards a position, a yaw and a lean."""
+    yaw = at.yaw + at.turn_to(yaw)
+    closing, along = (np.array([*axis, 0.0]) for axis in axes(yaw))
+    ahead = np.sin(lean) * along - np.cos(lean) * UP
+    return move(at, target, np.stack([closing, np.cross(ahead, closing), ahead], axis=1), grip)
+
+
+def move(at: Situation, target: Array, rotation: Array, grip: float) -> Array:
+    """Return the command that moves the hand towards a position and a rotation (3, 3): closing, across, ahead."""
+    step = GAIN * (target - at.hand) / REACH[:3]
+    step /= max(1.0, float(np.abs(step).max()))
+    turn = TURN_GAIN * _turn(at, rotation) / REACH[3:]
+    return np.array([*step, *(turn / max(1.0, float(np.abs(turn).max()))), grip])
+
+
+def _turn(at: Situation, wanted: Array) -> Array:
+    """Return the rotation vector (3,), in the world, from the hand's rotation to another one."""
+    quaternion, vector = np.empty(4), np.empty(3)
+    mujoco.mju_mat2Quat(quaternion, (wanted @ at.rotation.T).ravel())
+    mujoco.mju_quat2Vel(vector, quaternion, 1.0)
+    return vector
