@@ -13,14 +13,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rich.progress import track
-
 from vla.data.episode_filter import episode_filter
 from vla.data.episodes import DamageError, EpisodeStore
 from vla.data.header import Codec
 from vla.data.index import DAMAGED, LOST, Entry
 from vla.data.verification import entries_by_config, episode_of, without_rows
 from vla.io.errors import UserError
+from vla.io.printable import track
 
 Copies = Sequence[tuple[EpisodeStore, Entry]]  # of one seed and config
 Chosen = dict[str, dict[int, list[tuple[EpisodeStore, Entry]]]]  # config as JSON → seed → its copies

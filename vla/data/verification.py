@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from rich.progress import track
 
 from vla.data.episodes import DamageError, EpisodeStore, observations_of
 from vla.data.index import DAMAGED, LOST, MAX_LISTED, NOT_NEEDED, Entry, listed
 from vla.io.errors import UserError
+from vla.io.printable import track
 from vla.spec import Array, Episode
 
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import logging
 import re
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
 
 # Control characters but for tab and line feed, marks of writing direction, line separators, and halves of a character.
 HIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -31,3 +34,14 @@ def show(renderable: Any) -> None:
     console = get_console()
     parts = [each if each.control else Segment(printable(each.text), each.style) for each in console.render(renderable)]
     console.print(Segments(parts), end="")
+
+
+def track(items: Iterable[Item], description: str, total: float | None = None) -> Iterable[Item]:
+    """Show a progress bar of an iteration.
+
+    It is painted here and not in threads: they deadlock where an iteration that was given up is collected in one of
+    them.
+    """
+    from rich import progress
+
+    return progress.track(items, description, total, auto_refresh=False)

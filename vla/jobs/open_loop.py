@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.progress import track
 
 from vla.config.differences import at
 from vla.config.experiment import Experiment
@@ -20,7 +19,7 @@ from vla.data.header import is_store
 from vla.data.verification import episode_of
 from vla.io.errors import UserError
 from vla.io.files import warn_on_error, writing
-from vla.io.printable import show
+from vla.io.printable import show, track
 from vla.jobs.collect import demonstrations
 from vla.models.policy_folder import read_policy
 from vla.policy import costs

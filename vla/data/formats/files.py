@@ -15,13 +15,13 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from filelock import FileLock, Timeout
 from PIL import Image
-from rich.progress import track
 
 from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
 from vla.io.documents import read_json
 from vla.io.errors import UserError
 from vla.io.files import write_json, writing
+from vla.io.printable import track
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster, WorkersLost
 from vla.spec import Array, Spec

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rich.progress import track
 
 from vla.data.episodes import EpisodeStore
 from vla.io.errors import UserError
+from vla.io.printable import track
 from vla.spec import Array, Episode, Spec
 
 log = logging.getLogger(__name__)
