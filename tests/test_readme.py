@@ -119,7 +119,7 @@ def require_floors(measures: dict[str, dict[str, Any]]) -> None:
     precisions = ("fp32", "bf16") if has_bfloat16() else ("fp32",)
     assert set(measures) == {
         *("collect", *(f"collect: {stage}" for stage in stages), f"collect: {cores()} processes"),
-        *(f"collect: rendering, {name}" for name in ("fast", "smooth", "mujoco")),
+        *(f"collect: rendering, {name}" for name in ("fast", "smooth", "detailed", "mujoco")),
         *("loader", "loader: 1 frame", "loader: 6 frames"),
         *(f"loader: 3 x 224 px, {codec}{of}" for codec in ("lossless", "jpeg") for of in ("", ", 2500 x 100 steps")),
         *(f"train: {precision}" for precision in precisions),
