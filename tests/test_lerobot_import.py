@@ -480,11 +480,14 @@ def test_images_that_drift_away_from_their_steps_are_refused(tmp_path: Path) -> 
             require_video(tmp_path / "video.mp4", (16, 16), fps, count)
 
 
-def test_a_table_of_more_rows_than_recordings_have_is_not_read(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("limit", "says"), [("MAX_ROWS", r"has \d+ rows, more than the 5"), ("MAX_BYTES", r"unpacks to .* GB, more than")]
+)
+def test_a_table_larger_than_recordings_are_is_not_read(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, says: str
 ) -> None:
-    monkeypatch.setattr(tables, "MAX_ROWS", 5)
-    with pytest.raises(ValueError, match=r"file-000\.parquet has \d+ rows, more than the 5"):
+    monkeypatch.setattr(tables, limit, 5)
+    with pytest.raises(ValueError, match=rf"file-000\.parquet {says}"):
         demonstrations(changed(home, tmp_path / "dataset"), ARM_SPEC)
 
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from composing import composed
+from replaying import played, same
 
 from vla.config.experiment import Experiment
 from vla.io.errors import UserError
@@ -53,25 +54,6 @@ def opened(name: str) -> tuple[mujoco.MjModel, mujoco.MjData, Goal]:
     return model, data, Goal(model, task.goal)
 
 
-def played(environment: Libero, seed: int, steps: int = 5) -> list[Observation]:
-    """What is seen in the first steps of an episode with random actions."""
-    random = np.random.default_rng(seed)
-    seen = [environment.reset(seed)]
-    for _ in range(steps):
-        seen.append(environment.step(random.uniform(environment.spec.low, environment.spec.high)))
-    return seen
-
-
-def same(one: list[Observation], other: list[Observation]) -> bool:
-    """Whether states, truth and pictures are the same, bit for bit."""
-    return all(
-        np.array_equal(a.state, b.state)
-        and all(np.array_equal(a.rgb[name], b.rgb[name]) for name in a.rgb)
-        and all(np.array_equal((a.truth or {})[name], (b.truth or {})[name]) for name in a.truth or {})
-        for a, b in zip(one, other, strict=True)
-    )
-
-
 @pytest.mark.parametrize("name", ["object 3", "goal 9", "long 9"])
 def test_the_arm_moves_as_robosuites(name: str) -> None:
     model, data, _ = opened(name)
@@ -97,9 +79,9 @@ def test_every_predicate_is_judged_as_by_libero() -> None:
 
 def test_an_episode_is_a_function_of_its_seed() -> None:
     with closing(world("task.suite=goal")) as one:
-        first, between, again = played(one, 13), played(one, 20), played(one, 13)
+        first, between, again = played(one, 13, 5), played(one, 20, 5), played(one, 13, 5)
     with closing(world("task.suite=goal")) as other:
-        fresh = played(other, 13)
+        fresh = played(other, 13, 5)
     assert same(first, again)
     assert same(first, fresh)
     assert not np.array_equal(first[0].state, between[0].state)

@@ -15,6 +15,7 @@ from command_line import here
 from composing import composed
 from hydra.utils import instantiate
 from PIL import Image
+from replaying import played, same
 
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
@@ -22,7 +23,7 @@ from vla.deploy.client_observation import Keys
 from vla.parallel.pool import THIS_PROCESS
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import rollout
-from vla.spec import Array, Multitask, Observation
+from vla.spec import Array, Multitask
 from vla.tasks.metaworld import package
 from vla.tasks.metaworld.environment import MetaWorld, _command
 from vla.tasks.metaworld.expert import Scripted
@@ -38,25 +39,6 @@ def world(*overrides: str) -> MetaWorld:
     made = experiment("task.image_size=[96,96]", *overrides).make_environment()()
     assert isinstance(made, MetaWorld)
     return made
-
-
-def played(environment: MetaWorld, seed: int, steps: int) -> list[Observation]:
-    """What is seen in the first steps of an episode with random actions."""
-    random = np.random.default_rng(seed)
-    seen = [environment.reset(seed)]
-    for _ in range(steps):
-        seen.append(environment.step(random.uniform(environment.spec.low, environment.spec.high)))
-    return seen
-
-
-def same(one: list[Observation], other: list[Observation]) -> bool:
-    """Whether states, truth and pictures are the same, bit for bit."""
-    return all(
-        np.array_equal(a.state, b.state)
-        and all(np.array_equal(a.rgb[name], b.rgb[name]) for name in a.rgb)
-        and all(np.array_equal((a.truth or {})[name], (b.truth or {})[name]) for name in a.truth or {})
-        for a, b in zip(one, other, strict=True)
-    )
 
 
 def test_a_policy_trained_on_lerobots_data_gives_the_commands_of_meta_world() -> None:

@@ -178,9 +178,17 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a link to the outside": (link("config.json", "/etc/passwd"), "is a link that leaves the folder"),
     "a link to nothing": (link("training.json", "nothing"), r"has no training\.json"),
-    "a list": (text("config.json", "[]"), r"config\.json is damaged or of another kind"),
+    "a list": (
+        text("config.json", "[]"),
+        r"config\.json is of no policy of this project: it lacks task, tokenizer, mo",
+    ),
     "no JSON": (text("config.json", "{"), r"config\.json is damaged or of another kind"),
+    "a key twice": (text("config.json", '{"task": {}, "task": {"a": 1}}'), "a key stands twice"),
+    "a deep key twice": (text("training.json", '{"figures": {"a": 1, "a": 2}}'), "a key stands twice"),
     "deep JSON": (text("config.json", DEEP), r"config\.json is damaged or of another kind: .*recursion"),
+    "many levels": (key("config.json", task=json.loads('{"a":' * 99 + "1" + "}" * 99)), "more than 64 levels"),
+    "many values": (key("config.json", task={"a": [0] * 10**5}), r"more than \d+ values"),
+    "not a number": (text("config.json", '{"task": {"a": NaN}}'), r"config\.json is damaged .*NaN"),
     "an endless number": (text("config.json", '{"task": {"a": ' + "9" * 5000 + "}}"), r"config\.json is damaged"),
     "a reference": (
         key("config.json", model={"width": "${oc.env:HOME}"}),
@@ -219,6 +227,10 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "a pickle": (
         lambda folder: torch.save({"a": 1}, folder / "model.safetensors") or _sign(folder),
         r"model\.safetensors is damaged: ",
+    ),
+    "half precision": (
+        weights(lambda state: {name: value.half() for name, value in state.items()}),
+        r"does not fit the model .* numbers of torch\.float16, not torch\.float32",
     ),
     "names of folders": (
         weights(lambda state: {f"../{name}": value for name, value in state.items()}),

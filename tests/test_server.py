@@ -39,7 +39,7 @@ from vla.config.annotations import MissingLibrary, locate
 from vla.config.experiment import Experiment
 from vla.deploy.client_observation import Keys
 from vla.deploy.server import PolicyServer, Service
-from vla.io.array_messages import DTYPES, pack, unpack
+from vla.io.array_messages import DTYPES, LARGEST_MAP, LONGEST_LIST, pack, unpack
 from vla.models.flow import Flow
 from vla.models.model import Model
 from vla.policy import Policy
@@ -264,28 +264,39 @@ WHOLE = message(observations(1)[0])
 WRONG: dict[str, tuple[Any, str]] = {
     "text": ("hello", "is a binary message in msgpack, not text"),
     "noise": (b"\xc1\x00", "is no message in msgpack with arrays of numbers"),
+    "half": (pack(WHOLE)[:100], "is no message in msgpack"),
     "list": (pack([1, 2]), "an observation is a map, not list"),
+    "empty": (pack({}), "lacks observation/image, observation/state, prompt: it has nothing"),
     "keys": (pack({"image": 1, "prompt": "go"}), "lacks observation/image, observation/state: it has image, prompt"),
     "image": (pack({**WHOLE, "observation/image": np.zeros((4, 4), np.uint8)}), r"is an image \(H, W, 3\).*\(4, 4\)"),
     "range": (pack({**WHOLE, "observation/image": np.full((4, 4, 3), 255.0)}), "send uint8, or floats from 0 to 1"),
     "state": (pack({**WHOLE, "observation/state": np.zeros(3)}), "has 3 numbers, the policy needs 2: east, north"),
+    "finite": (pack({**WHOLE, "observation/state": [np.nan, 0.0]}), "holds a number that is not finite"),
+    "words": (pack({**WHOLE, "observation/state": "far"}), "observation/state is not a vector of numbers"),
+    "digits": (pack({**WHOLE, "observation/state": ["1", "1"]}), "observation/state is not a vector of numbers"),
     "rows": (pack({**WHOLE, "observation/state": [[1.0], [1.0, 2.0]]}), "observation/state is not a vector of numbers"),
+    "nothing": (pack({**WHOLE, "observation/state": [None, 1.0]}), "observation/state is not a vector of numbers"),
     "prompt": (
         pack({**WHOLE, "prompt": "a" * (LONGEST_INSTRUCTION + 1)}),
         "has 1001 characters, an instruction at most",
     ),
+    "prompts": (pack({**WHOLE, "prompt": ["go"]}), "prompt is an instruction, a text, not list"),
     "seed": (pack({"reset": True, "seed": -1}), "seed is -1, expected an integer"),
+    "seed as a text": (pack({"reset": True, "prompt": "go", "seed": "5"}), "seed is '5', expected an integer"),
     "half a seed": (pack({"reset": True, "prompt": "go", "seed": np.float32(0.5)}), "seed is 0.5, expected an integer"),
+    "escapes": (pack({"\x1b]0;evil\x07\nerror: none": 1}), "the observation lacks"),
     "objects": (
         msgpack.packb({b"__ndarray__": True, b"dtype": "|O", b"data": b"cos\nsystem\n", b"shape": [1]}),
         r"has the type \|O, expected one of",
     ),
     "short": (
         msgpack.packb({b"__ndarray__": True, b"dtype": "<f8", b"data": b"", b"shape": [10**9, 10**9]}),
-        "cannot reshape array of size 0",
+        "has too many or too few bytes",
     ),
     "reset without a prompt": (pack({"reset": True, "seed": 7}), "prompt is an instruction"),
     "deep": (b"\x91" * 100_000 + b"\x01", "is no message in msgpack"),
+    "lists": (msgpack.packb([[0] * 1000] * (LONGEST_LIST // 1000)), "hold more than 10000 items"),
+    "maps": (msgpack.packb([{}] * (LARGEST_MAP + 1)), "more than 1000 maps"),
 }
 
 

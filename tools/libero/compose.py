@@ -61,7 +61,6 @@ def composed(task: Any) -> tuple[str, dict[str, Any]]:
             name: {key: region[key] for key in ("target", "ranges", "yaw_rotation")}
             for name, region in env.parsed_problem["regions"].items()
         },
-        "interest": env.parsed_problem["obj_of_interest"],
         "table": [float(value) for value in env.workspace_offset],
         "fixtures": {
             name: {

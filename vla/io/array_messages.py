@@ -2,11 +2,12 @@
 
 An array is a map of `__ndarray__`, `data`, `dtype` and `shape`, a NumPy scalar one of `__npgeneric__`, `data` and
 `dtype`, all with keys of bytes (openpi_client/msgpack_numpy.py of github.com/Physical-Intelligence/openpi). Messages
-are data from strangers: only plain numbers are decoded, and nothing is executed.
+are data from strangers: only plain numbers are decoded, nothing is executed, and sizes are bounded.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,10 @@ try:
 except ModuleNotFoundError as error:
     hint = f"install this package with its extra server, as in pip install -e '.[server]' ({error})"
     raise ModuleNotFoundError(hint, name=error.name) from error
+
+LONGEST_LIST = 10_000  # items of a list, or of all lists in a message
+LONGEST_TEXT = 100_000  # characters of a string
+LARGEST_MAP = 1000  # keys of a map, or maps in a message
 
 DTYPES = {np.dtype(name).str: np.dtype(name) for name in ("bool", *"bBhHiIlLqQ", *"efd")}
 
@@ -37,13 +42,36 @@ def unpack(data: bytes) -> Any:
     """Decode a message; arrays are read-only views of `data`, and those without a dimension are Python's numbers.
 
     Raises:
-        UserError: it is damaged, or holds something else than plain values and arrays of numbers.
+        UserError: it is damaged, too large, or holds something else than plain values and arrays of numbers.
     """
+    budget = _Budget()
+    bounds = {"max_array_len": LONGEST_LIST, "max_map_len": LARGEST_MAP, "max_str_len": LONGEST_TEXT, "max_ext_len": 0}
     try:
-        return msgpack.unpackb(data, object_hook=_decode, max_ext_len=0)
+        return msgpack.unpackb(data, object_hook=budget.take_map, list_hook=budget.take_list, **bounds)
     except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as error:
         what = str(error)[:200] or type(error).__name__
         raise UserError(f"this is no message in msgpack with arrays of numbers: {what}") from error
+
+
+class _Budget:
+    """Hooks of the decoder, which bound the number of lists and maps: small messages could fill the memory."""
+
+    def __init__(self) -> None:
+        self._items, self._maps = LONGEST_LIST, LARGEST_MAP
+
+    def take_list(self, values: list[Any]) -> list[Any]:
+        self._items -= 1 + len(values)
+        if self._items < 0:
+            raise UserError(f"its lists hold more than {LONGEST_LIST} items: send arrays")
+        return values
+
+    def take_map(self, values: dict[Any, Any]) -> Any:
+        self._maps -= 1
+        if self._maps < 0:
+            raise UserError(f"it holds more than {LARGEST_MAP} maps")
+        if b"__ndarray__" in values:
+            return _array(values)
+        return _scalar(values) if b"__npgeneric__" in values else values
 
 
 def _encode(value: Any) -> Any:
@@ -55,14 +83,25 @@ def _encode(value: Any) -> Any:
     return {b"__npgeneric__": True, b"data": value.item(), b"dtype": kind.str}
 
 
-def _decode(values: dict[Any, Any]) -> Any:
-    """Return the array or the number that a map stands for, or the map itself."""
-    if not values.keys() & {b"__ndarray__", b"__npgeneric__"}:
-        return values
+def _array(values: dict[Any, Any]) -> np.ndarray:
+    dtype, data, shape = _dtype(values), values.get(b"data"), values.get(b"shape")
+    if not isinstance(shape, list) or len(shape) > 8 or not all(type(n) is int and n >= 0 for n in shape):
+        raise UserError("an array has no valid shape")
+    if not isinstance(data, bytes) or len(data) != math.prod(shape) * dtype.itemsize:
+        raise UserError(f"an array of shape {shape} has too many or too few bytes")
+    array = np.frombuffer(data, dtype).reshape(shape)
+    return array if shape else array.item()
+
+
+def _scalar(values: dict[Any, Any]) -> Any:
+    dtype, data = _dtype(values), values.get(b"data")
+    if not isinstance(data, (bool, int, float)):
+        raise UserError("a NumPy scalar is no number")
+    return np.array(data, dtype).item()
+
+
+def _dtype(values: dict[Any, Any]) -> np.dtype[Any]:
     name = values.get(b"dtype")
     if not isinstance(name, str) or name not in DTYPES:
         raise UserError(f"an array has the type {str(name)[:50]}, expected one of {', '.join(DTYPES)}")
-    if b"__npgeneric__" in values:
-        return np.array(values.get(b"data"), DTYPES[name]).item()
-    array = np.frombuffer(values.get(b"data", b""), DTYPES[name]).reshape(values.get(b"shape"))
-    return array if array.ndim else array.item()
+    return DTYPES[name]

@@ -117,8 +117,18 @@ def resolved(value: Any, name: str) -> Any:
 
 
 def read_resolved(path: Path) -> Any:
-    """Read the JSON file at `path` as a configuration, see `resolved`."""
-    return resolved(read_json(path, dict[str, Any]), str(path))
+    """Read the JSON file at `path` as a configuration, see `resolved`; a UserError also if a key stands twice."""
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(found := dict(pairs)) < len(pairs):
+            raise UserError("a key stands twice")
+        return found
+
+    try:
+        value = json.loads(read_bounded(path), object_pairs_hook=unique, parse_constant=int)  # which NaN is not
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is damaged or of another kind: {str(error)[:200]}") from error
+    return resolved(value, str(path))
 
 
 def mappings(value: Any) -> Iterator[dict[Any, Any]]:

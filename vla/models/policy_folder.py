@@ -100,6 +100,9 @@ class SavedPolicy:
         try:
             with self.budget():
                 model.load_state_dict(state)
+            for name, value in (*model.named_parameters(), *model.named_buffers()):
+                if name in state and state[name].dtype != value.dtype:
+                    raise UserError(f"{name} has numbers of {state[name].dtype}, not {value.dtype}")
         except Exception as error:  # whatever modules raise for a state that is not theirs
             first = lines_of(error)[-1].strip()[:200]
             raise UserError(f"{self.folder} does not fit the model of its own configuration: {first}") from error

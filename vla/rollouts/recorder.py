@@ -204,13 +204,6 @@ def draw_shapes(stream: rr.RecordingStream, shapes: Iterable[Shape]) -> None:
         stream.log(_path("world", shape.body, shape.name), place, _solid(shape), static=True)
 
 
-def draw_poses(stream: rr.RecordingStream, poses: Mapping[str, Array]) -> None:
-    """Log the current poses of the bodies of `draw_shapes`."""
-    for body, pose in poses.items():
-        place = rr.Transform3D(translation=pose[:3], quaternion=_xyzw(pose[3:]))
-        stream.log(_path("world", body), place)
-
-
 def _by_unit(units: Sequence[str]) -> dict[str, list[int]]:
     """Return unit → indices of its components."""
     return {unit: [index for index, other in enumerate(units) if other == unit] for unit in dict.fromkeys(units)}

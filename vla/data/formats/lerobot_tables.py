@@ -6,7 +6,7 @@ Shapes: N steps, D components, H by W pixels.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from vla.spec import Array
 REMEDY = "copy the dataset again from where it is whole"  # where a copy may be damaged or incomplete
 MEND = "correct the dataset, or write it again"  # where a copy cannot help
 MAX_ROWS = 10_000_000  # of a file: 280 hours at 10 Hz
+MAX_BYTES = 2**33  # to unpack at once
 MAX_SECONDS = 1e6  # video [s]
 
 Column = pa.ChunkedArray
@@ -74,11 +75,13 @@ def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -
     """Read the named columns of Parquet files, concatenated; `only` filters rows.
 
     Raises:
-        UserError: a file is damaged, has too many rows, or lacks a column of the expected type.
+        UserError: a file is damaged, is too large, or lacks a column of the expected type.
     """
     tables = list[pa.Table]()
     for path in paths:
         require(path, columns)
+        if (unpacked := _unpacked_size(path, columns, only is not None)) > MAX_BYTES:
+            raise UserError(f"{path} unpacks to {unpacked / 1e9:.0f} GB, more than the {MAX_BYTES / 1e9:.0f} GB it may")
         try:
             table = pq.read_table(path, columns=[*columns], filters=only, page_checksum_verification=True)
             table.validate(full=True)
@@ -90,6 +93,19 @@ def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -
         return pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
         raise UserError(f"{paths[0]} and others beside it differ ({str(error)[:200]}): {MEND}") from error
+
+
+def _unpacked_size(path: Path, columns: Collection[str], filtered: bool) -> int:
+    """Estimate the decoded size of columns [bytes], summed over row groups or, if filtered, of the largest one.
+
+    The estimate uses the metadata of the file; dictionary-encoded texts can take more memory.
+    """
+    metadata, sizes = pq.read_metadata(path), []
+    for group in (metadata.row_group(number) for number in range(metadata.num_row_groups)):
+        of = [group.column(number) for number in range(group.num_columns)]
+        chosen = [each for each in of if any(f"{each.path_in_schema}.".startswith(f"{name}.") for name in columns)]
+        sizes.append(sum(max(column.total_uncompressed_size, 8 * column.num_values) for column in chosen))
+    return (max if filtered else sum)([0, *sizes])
 
 
 def require(path: Path, columns: Mapping[str, Kind]) -> None:

@@ -157,10 +157,10 @@ class Libero(World):
     def _look(self) -> Observation:
         scene = self._scene
         pictures = () if self._blind else scene.pictures(self._mirror)
-        subject, *_, place = [part for part in self._task.goal[0][1:] for _ in (0, 1)]
+        _, subject, *_ = self._task.goal[0]
         truth = {
             "object": scene.position(subject),
-            "goal": scene.position(place),
+            "goal": scene.position(self._task.goal[0][-1]),
             "commanded_position": scene.data.site_xpos[scene.controller.site].copy(),
             "task": np.array([ALL.index(self._task.suite), self._task.number]),
             "positions": scene.data.qpos.copy(),
@@ -184,7 +184,7 @@ class Scene:
         Raises:
             UserError: there is no such camera.
         """
-        self.model = model = load_scene(task.scene, [name for name, *_ in _things(task)], detail)
+        self.model = model = load_scene(task.scene, _things(task), detail)
         self.data = mujoco.MjData(model)
         self.controller = Controller(model)
         known = [model.camera(number).name for number in range(model.ncam)]
@@ -247,9 +247,9 @@ class Scene:
             self._renderer = None
 
 
-def _things(task: Task) -> list[tuple[str, ...]]:
-    """Return (name,) of the movable things in a scene."""
-    return sorted({(part[1],) for part in task.initial if part[0] in ("on", "in") and part[1] not in task.fixtures})
+def _things(task: Task) -> set[str]:
+    """Return the names of the movable things in a scene."""
+    return {part[1] for part in task.initial if part[0] in ("on", "in")} - task.fixtures.keys()
 
 
 def command_of(action: Array) -> Array:

@@ -48,7 +48,6 @@ class Task:
     initial: tuple[tuple[str, ...], ...]  # predicates that hold at the start
     regions: Mapping[str, Mapping[str, Any]]  # name → target, ranges and yaw_rotation, as its problem file has them
     fixtures: Mapping[str, Mapping[str, Any]]  # name → body, position [m] and quaternion for the official states
-    interest: tuple[str, ...]  # objects and places that the instruction is about
     states: str  # file of the initial states, in the wheel
 
     @property
@@ -118,7 +117,6 @@ def _task(suite: str, number: int, entry: Mapping[str, Any]) -> Task:
         initial=tuple(map(tuple, entry["initial"])),
         regions=entry["regions"],
         fixtures=entry["fixtures"],
-        interest=tuple(entry["interest"]),
         states=entry["states"],
     )
 
