@@ -20,7 +20,7 @@ import warm
 from trials import CHECKPOINT, SMALL, TRAIN, Trials, digest, ended, last, run
 
 MEASURED = ("latency", "budget", "seconds", "duration", "_ms", "_s")  # what no two evaluations have in common
-PLACES = ("output", "folder")  # of the run
+PLACES = ("output", "folder", "command")  # of the run
 LONGER = (*TRAIN, "trainer.max_steps=60", "trainer.val_check_interval=5", "data.validation_fraction=0.2")
 
 

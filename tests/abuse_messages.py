@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -100,7 +100,7 @@ class World:
                 self._told = time.monotonic()
             if hostile:
                 publisher, message = hostile[number % len(hostile)]
-                publisher.publish(message)
+                publisher.publish(message(where) if callable(message) else message)
             number += 1
             tick = time.monotonic() + 0.02
             while time.monotonic() < tick:
@@ -137,14 +137,17 @@ class World:
             *({"data": b""}, {"data": bytes(3071)}, {"height": 1, "width": 1, "step": 3, "data": bytes(3)}),
             {"height": 2000, "width": 2000, "step": 6000, "data": bytes(12_000_000)},
         ]
-        still = [*HOME, 0.04, 0.04]
-        states = [
-            *(self.joints([value, *still[1:]]) for value in (NAN, INF, -INF)),
-            *(self.joints(still, velocity=velocity) for velocity in ([NAN] * 9, [0.0], [INF] * 9)),
-            *(self.joints(position) for position in ([], still[:5], still * 1000)),
-            *(self.joints(still, name=names) for names in ([], ["a"] * 9, ["x" * 100_000] * 9, ["panda_joint1"] * 9)),
+        # Where the arm is: a joint state that claims another place is no nonsense, and the arm is to hold it.
+        states: list[Callable[[list[float]], Any]] = [
+            *(lambda at, value=value: self.joints([value, *at[1:]]) for value in (NAN, INF, -INF)),
+            *(lambda at, speed=speed: self.joints(at, velocity=speed) for speed in ([NAN] * 9, [0.0], [INF] * 9)),
+            *(lambda _, at=at: self.joints(at) for at in ([], [*HOME][:5], [*HOME, 0.04, 0.04] * 1000)),
+            *(
+                lambda at, names=names: self.joints(at, name=names)
+                for names in ([], ["a"] * 9, ["x" * 100_000] * 9, ["panda_joint1"] * 9)
+            ),
         ]
-        far = [self.joints([value, *still[1:]]) for value in (1e308, -1e30, 100.0)]
+        far = [self.joints([value, *HOME[1:], 0.04, 0.04]) for value in (1e308, -1e30, 100.0)]
         texts = [
             "",
             " " * 999,

@@ -17,7 +17,7 @@ from vla.deploy.motion import Command
 ROBOT = JointLimits(
     joints=["one", "two"],
     low=[-1.0] * 2,
-    high=[1.0] * 2,
+    high=[2.0] * 2,
     speed=[1.0] * 2,
     acceleration=[1.0] * 2,
     fingers=["left", "right"],
@@ -125,6 +125,7 @@ def test_joints_are_found_by_name() -> None:
         ({"position": [1.0]}, "5 names, 1 positions"),
         ({"velocity": [1.0]}, "1 velocities"),
         ({"position": [0.03, float("nan"), 9.0, 1.0, 0.01]}, "not finite"),
+        ({"position": [0.03, 2.0, 9.0, 1e308, 0.01]}, "has one at 1e\\+308 rad, where this arm cannot be"),
     ],
 )
 def test_joint_states_that_do_not_fit_are_refused(changed: dict, reason: str) -> None:

@@ -37,6 +37,7 @@ HANDED_OVER = "handed over"  # in the agent's status: yes if a person moves the 
 MOST_PIXELS = 4096 * 4096  # of a compressed image, whose header may promise any number
 LONGEST = 100_000  # characters of a message about an episode
 FINGERS_AGE = 0.5  # oldest state of fingers that come in messages of their own [s]
+BEYOND = 0.5  # its limits, where an arm that a person moved may still be [rad]
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,8 @@ class JointStates:
             at: when it came [s].
 
         Raises:
-            UserError: a joint is missing or named twice, the lengths differ, or a number is not finite.
+            UserError: a joint is missing or named twice, the lengths differ, a number is not finite, or a joint is
+                where the arm cannot be.
         """
         arm, fingers, names = self._limits.joints, self._limits.fingers, {*message.name}
         of_gripper = names >= {*fingers} and names.isdisjoint(arm)  # which may have further joints
@@ -135,9 +137,16 @@ class JointStates:
             self._fingers = (at, float(_positions(message, fingers)[0].sum()))
             return None
         if at - self._fingers[0] <= FINGERS_AGE and names.isdisjoint(fingers):
-            return *_positions(message, arm), self._fingers[1]
-        position, velocity = _positions(message, [*arm, *fingers])
-        return position[: len(arm)], velocity[: len(arm)], float(position[len(arm) :].sum())
+            position, velocity = _positions(message, arm)
+            opening = self._fingers[1]
+        else:
+            position, velocity = _positions(message, [*arm, *fingers])
+            opening = float(position[len(arm) :].sum())
+        place, low, high = position[: len(arm)], np.array(self._limits.low), np.array(self._limits.high)
+        if (beyond := (place < low - BEYOND) | (place > high + BEYOND)).any():
+            joint = int(np.argmax(beyond))
+            raise UserError(f"joint state has {arm[joint]} at {place[joint]:g} rad, where this arm cannot be")
+        return place, velocity[: len(arm)], opening
 
 
 def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ from vla.spec import Array, Environment, Episode, HasEvents, HasScene, Observati
 VIEWER = str(Path(rerun_cli.__file__).with_name("rerun"))  # the binary: killing its wrapper script would orphan it
 CURVES = np.array([0xE5574CFF, 0x5ABE64FF, 0x508CF0FF, 0xF0AA3CFF, 0xB46EE6FF, 0x3CC8C8FF, 0xDCDCDCFF], np.uint32)
 EVENTS = "events"  # entity of the log
-TOKENS = (49, 256)  # height and width of the image of token probabilities [px]
+TOKENS = (56, 84)  # height and width of the image of token probabilities [px]
 
 
 def recording_name(seed: int, outcome: str) -> str:
@@ -110,7 +110,7 @@ class _Writer:
         self._stream.send_recording_name(f"{episode.outcome}: {episode.instruction}")
         self._stream.send_property("episode", rr.AnyValues(outcome=episode.outcome, seed=episode.seed, steps=steps))
         end = f"{'✔' if episode.success else '✘'} **{episode.outcome}** after {steps} steps, seed {episode.seed}"
-        draws = "\n".join(f"- **{axis}** {draw}" for axis, draw in episode.draws.items())
+        draws = "\n".join(f"- **{axis}** {_said(draw)}" for axis, draw in episode.draws.items())
         said = [seen.instruction for seen in episode.observations]
         given = [step for step in range(steps) if step == 0 or said[step] != said[step - 1]]
         texts = [f"### {said[step]}\n\n{end}" for step in given]
@@ -160,13 +160,13 @@ class _Writer:
     def tokens(self, steps: Array, probabilities: Array) -> None:
         """Write the probabilities (N, D, K) of steps (N,) as images: a row per component, scaled by its maximum."""
         components, bins = probabilities.shape[1:]
-        row, columns = TOKENS[0] // components, np.arange(TOKENS[1]) * bins // TOKENS[1]  # [px]
+        row, first = TOKENS[0] // components, np.arange(TOKENS[1]) * bins // TOKENS[1]  # [px], bin of each column
         # The square root makes small probabilities visible.
-        strength = np.sqrt(probabilities / probabilities.max(axis=2, keepdims=True))
-        pixels = np.round(strength * 255).astype(np.uint8)[:, :, columns].repeat(row, axis=1)
+        strength = np.maximum.reduceat(np.sqrt(probabilities / probabilities.max(axis=2, keepdims=True)), first, axis=2)
+        pixels = np.round(strength * 255).astype(np.uint8).repeat(row, axis=1)
         pixels[:, ::row] = 0  # a line between rows
         self._shades("tokens", steps, pixels, "inferno", (0.0, 255.0))
-        beside = [(-32.0, (index + 0.5) * row) for index in range(components)]
+        beside = [(-11.0, (index + 0.5) * row) for index in range(components)]
         self._static("tokens/names", rr.Points2D(beside, labels=self._spec.action, radii=0.0, show_labels=True))
 
     def _shades(self, path: str, steps: Array, pixels: Array, colours: Any, ends: Any, **fields: float) -> None:
@@ -207,6 +207,15 @@ def draw_shapes(stream: rr.RecordingStream, shapes: Iterable[Shape]) -> None:
 def _by_unit(units: Sequence[str]) -> dict[str, list[int]]:
     """Return unit → indices of its components."""
     return {unit: [index for index, other in enumerate(units) if other == unit] for unit in dict.fromkeys(units)}
+
+
+def _said(drawn: Any) -> str:
+    """Return what was drawn as text for a person: plain data, numbers with three digits."""
+    if isinstance(drawn, Mapping):
+        return ", ".join(f"{name} {_said(value)}" for name, value in drawn.items())
+    if isinstance(drawn, (list, tuple)):
+        return " ".join(map(_said, drawn))
+    return f"{drawn:.3g}" if isinstance(drawn, float) else str(drawn)
 
 
 def _path(*parts: str) -> str:
@@ -261,7 +270,7 @@ def _blueprint(spec: Spec, tokens: bool, events: bool, viewpoint: tuple[Point, P
     states = _curves("state", spec.state_units)
     plots: list[Any] = _curves("action", spec.units)
     if tokens:
-        bounds = rrb.VisualBounds2D(x_range=(-64, TOKENS[1] + 4), y_range=(-4, TOKENS[0] + 4))
+        bounds = rrb.VisualBounds2D(x_range=(-22, TOKENS[1] + 1), y_range=(-2, TOKENS[0] + 2))
         plots.append(rrb.Spatial2DView(origin="/tokens", name="token probabilities", visual_bounds=bounds))
     above: Any = rrb.Vertical(
         rrb.Horizontal(*texts), rrb.Grid(*views, grid_columns=len(spec.cameras)), row_shares=[1, 3]
