@@ -11,6 +11,7 @@ from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from vla.config.annotations import locate
@@ -248,6 +249,7 @@ class Experiment:
         learner = self.learner(store.spec, origin)
         if origin is None:
             self.fit_tokenizer(learner.model.tokenizer, store)
+        learner.model.fit(np.asarray(store.rows("state")), np.asarray(store.rows("action")))
         return learner
 
     def data(

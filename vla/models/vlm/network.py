@@ -7,6 +7,7 @@ an action as the network has them, padded.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from typing import ClassVar, NamedTuple
 
 from torch import Tensor, nn
@@ -29,8 +30,10 @@ class FlowNetwork(nn.Module, ABC):
     A subclass is built as `network()` by the factory of a YAML node: all sizes are its arguments.
     """
 
-    # How a published checkpoint names the weights: beginnings of names there and here; the first that fits counts.
+    # How published weights are named, those of a whole policy of LeRobot and those of the vision-language model alone:
+    # beginnings of names there and here. The first that fits counts.
     published: ClassVar[tuple[tuple[str, str], ...]] = ()
+    pretrained: ClassVar[tuple[tuple[str, str], ...]] = ()
     unused: ClassVar[tuple[str, ...]] = ()  # beginnings of published names that no action depends on
 
     resolution: int  # height and width of an image [px]
@@ -55,3 +58,11 @@ class FlowNetwork(nn.Module, ABC):
 
         Time is 1 for noise and 0 for actions: (B,), or (B, k) with one per action.
         """
+
+
+def renamed(name: str, beginnings: Iterable[tuple[str, str]]) -> str:
+    """Return a published name with its beginning as it is here, given pairs of beginnings there and here."""
+    for theirs, ours in beginnings:
+        if name.startswith(theirs):
+            return ours + name.removeprefix(theirs)
+    return name
