@@ -134,7 +134,7 @@ def test_images_of_another_aspect_ratio_lie_in_the_corner_or_in_the_centre() -> 
 
 def test_the_state_is_read_as_numbers_within_the_prompt(tokenizer: Path) -> None:
     for name in (str(tokenizer), None):
-        prompt = Prompt(name, 90, state=True)
+        prompt = Prompt(name, 90, state=True, width=1)
         state = torch.tensor([[-1.5, -1.0, 0.0, 0.999], [0.5, 0.25, -0.2, 2.0]])
         tokens = prompt(prompt.tokenize(["lift_it\n", "put the block away"]), state)
         # Bins as openpi computes them.

@@ -21,11 +21,10 @@ from vla.io.errors import UserError
 from vla.io.types import Shift, Steps, Text
 from vla.models.layers import Batch, mean_where
 from vla.models.model import Model, Prediction
-from vla.models.text.ngrams import TextEncoder
 from vla.models.tokenizers.tokenizer import ActionTokenizer
 from vla.models.vlm.network import FlowNetwork, Prefix
 from vla.models.vlm.normalizer import Kind, Normalizer
-from vla.models.vlm.prompt import PADDING
+from vla.models.vlm.prompt import PADDING, Prompt
 from vla.models.vlm.trunk import Trunk
 from vla.spec import Spec
 
@@ -67,7 +66,7 @@ class VisionLanguageAction(Model):
     def __init__(
         self,
         network: Callable[[], FlowNetwork],
-        text: Callable[..., TextEncoder],
+        text: Callable[..., Prompt],
         trunk: Text | None,
         cameras: dict[str, str | None] | None,
         chunk: Steps,
@@ -77,7 +76,7 @@ class VisionLanguageAction(Model):
         normalization: Kind,
         statistics: Literal["demonstrations", "pretrained"],
         place: Place,
-        shift: Shift = (0, 0),
+        shift: Shift,
         *,
         spec: Spec,
         tokenizer: ActionTokenizer,
