@@ -24,6 +24,7 @@ from vla.models.model import Model, Prediction
 from vla.models.tokenizers.tokenizer import ActionTokenizer
 from vla.models.vlm.network import FlowNetwork, Prefix
 from vla.models.vlm.normalizer import Kind, Normalizer
+from vla.models.vlm.packed_linear import pack
 from vla.models.vlm.prompt import PADDING, Prompt
 from vla.models.vlm.trunk import Trunk
 from vla.spec import Spec
@@ -87,6 +88,7 @@ class VisionLanguageAction(Model):
         origin = None if trunk is None else Trunk(trunk)
         self.cameras = _cameras(cameras, spec, origin)
         self.network = network() if origin is None else origin.build(network)
+        pack(self.network)
         _require_width("state", len(spec.pose), self.network.state_width or len(spec.pose))
         _require_width("action", len(spec.action), self.network.action_width)
         self.state_normalizer = Normalizer(normalization, len(spec.pose))
