@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import lightning
+import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
 
@@ -95,6 +96,8 @@ def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_s
     store, model = demonstrations(experiment), learner.model
     if origin is last is None:
         experiment.fit_tokenizer(model.tokenizer, store)
+    if last is None:
+        model.fit(np.asarray(store.rows("state")), np.asarray(store.rows("action")))
     _warn_of_tokenization(model, [store, *(each for each in more if each.episodes)])
     data = _windows(experiment, store, model, trainer)
     if last:

@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -93,6 +94,9 @@ class Model(nn.Module, ABC):
         if auxiliary > 0 and spec.truth_size > 0:
             self.truth_head = nn.Linear(width, spec.truth_size)
             self.truth_scale = RunningNormalizer(spec.truth_size)
+
+    def fit(self, states: np.ndarray, actions: np.ndarray) -> None:
+        """Fit what the model keeps of the demonstrations, (N, P) states and (N, D) actions of all steps: nothing."""
 
     def augment(self, batch: Batch) -> Batch:
         """Return a training batch with randomly shifted images; this part is not compiled."""

@@ -1,0 +1,74 @@
+"""The networks of vision-language-action models: a prefix of images and sentence, and a velocity of actions given it.
+
+Shapes: B batch, C cameras, L tokens of the sentence, S state, P tokens of the prefix, k action chunk, A components of
+an action as the network has them, padded.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from typing import Any, ClassVar, NamedTuple
+
+from torch import Tensor, nn
+
+
+class Prefix(NamedTuple):
+    """What actions attend to: images, sentence and perhaps state, encoded once per plan and never changed."""
+
+    keys: tuple[Tensor, ...]  # of each layer, (B, heads, P, width of a head), positions applied
+    values: tuple[Tensor, ...]  # of each layer, (B, heads, P, width of a head)
+    present: Tensor  # (B, P) bool, false for padding
+
+
+class FlowNetwork(nn.Module, ABC):
+    """A pretrained trunk with an expert that predicts the velocity of noisy actions.
+
+    The prefix never attends to the actions. So training computes it too, once for a batch, and the gradients of the
+    velocity reach the trunk through its keys and values.
+
+    A subclass is built as `network()` by the factory of a YAML node: all sizes are its arguments.
+    """
+
+    # How published weights are named, those of a whole policy of LeRobot and those of the vision-language model alone:
+    # beginnings of names there and here. The first that fits counts.
+    published: ClassVar[tuple[tuple[str, str], ...]] = ()
+    pretrained: ClassVar[tuple[tuple[str, str], ...]] = ()
+    unused: ClassVar[tuple[str, ...]] = ()  # beginnings of published names that no action depends on
+
+    kind: ClassVar[str] = ""  # LeRobot's name of the policy
+
+    resolution: int  # height and width of an image [px]
+    state_width: int  # S, padded with zeros; 0: the state is part of the sentence
+    action_width: int  # A, padded with zeros
+
+    def options(self) -> dict[str, Any]:
+        """Return the options by which LeRobot describes this network, as far as they are not its defaults."""
+        return {}
+
+    @abstractmethod
+    def prefix(self, images: Tensor, cameras: Tensor, tokens: Tensor, sentence: Tensor, state: Tensor | None) -> Prefix:
+        """Encode what is known before actions are chosen.
+
+        Args:
+            images: (B, C, 3, H, W) float32 in -1 … 1, of `resolution`.
+            cameras: (B, C) bool, false where a camera is missing.
+            tokens: (B, L) int64.
+            sentence: (B, L) bool, false for padding at the end.
+            state: (B, S) float32, normalised and padded; None where `state_width` is 0.
+        """
+
+    @abstractmethod
+    def velocity(self, prefix: Prefix, noisy: Tensor, time: Tensor) -> Tensor:
+        """Predict the velocity, (B, k, A) float32, of (B, k, A) noisy actions.
+
+        Time is 1 for noise and 0 for actions: (B,), or (B, k) with one per action.
+        """
+
+
+def renamed(name: str, beginnings: Iterable[tuple[str, str]]) -> str:
+    """Return a published name with its beginning as it is here, given pairs of beginnings there and here."""
+    for theirs, ours in beginnings:
+        if name.startswith(theirs):
+            return ours + name.removeprefix(theirs)
+    return name

@@ -1,0 +1,82 @@
+"""Normalisation of states and actions by statistics of a dataset, which have the names that LeRobot gives them.
+
+Shapes: N steps, W components, … any leading dimensions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from vla.io.errors import UserError
+
+Kind = Literal["mean_std", "quantiles"]
+EPSILON = 1e-8  # of a standard deviation, and in place of a range of 0
+
+
+class Normalizer(nn.Module):
+    """Values → mean 0 and standard deviation 1, or the first percentile at -1 and the last at 1; nothing is clipped.
+
+    Args:
+        kind: which of the two.
+        width: W.
+    """
+
+    mean: Tensor
+    std: Tensor
+    q01: Tensor
+    q99: Tensor
+
+    def __init__(self, kind: Kind, width: int) -> None:
+        super().__init__()
+        self.kind, self.statistics = kind, ("mean", "std") if kind == "mean_std" else ("q01", "q99")
+        identity = torch.zeros(width) if kind == "mean_std" else -torch.ones(width)
+        self.register_buffer(self.statistics[0], identity)
+        self.register_buffer(self.statistics[1], torch.ones(width))
+
+    def fit(self, values: np.ndarray) -> None:
+        """Take the statistics of (N, W) values."""
+        if self.kind == "mean_std":
+            fitted = {"mean": values.mean(0, dtype=np.float64), "std": values.std(0, dtype=np.float64)}
+        else:
+            fitted = dict(zip(self.statistics, np.quantile(values, (0.01, 0.99), axis=0), strict=True))
+        for name, value in fitted.items():
+            getattr(self, name).copy_(torch.from_numpy(value))
+
+    def take(self, statistics: Mapping[str, Tensor], feature: str, source: object) -> None:
+        """Take published statistics, name → (W,), of a feature such as "action".
+
+        Raises:
+            UserError: they lack the feature, or are of another width.
+        """
+        for name in self.statistics:
+            own, found = getattr(self, name), statistics.get(f"{feature}.{name}")
+            if found is None:
+                raise UserError(
+                    f"{source} has no {feature}.{name}, so what it says of {feature} cannot be put into units: "
+                    "model.statistics=demonstrations takes those of the demonstrations"
+                )
+            if found.shape != own.shape:
+                raise UserError(f"{source} has {feature}.{name} of {found.numel()} components, not of {own.numel()}")
+            own.copy_(found)
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Normalise (…, W) values."""
+        if self.kind == "mean_std":
+            return (values - self.mean) / (self.std + EPSILON)
+        return 2 * (values - self.q01) / self._range - 1
+
+    def inverse(self, values: Tensor) -> Tensor:
+        """Invert `forward`."""
+        if self.kind == "mean_std":
+            return values * self.std + self.mean
+        return (values + 1) * self._range / 2 + self.q01
+
+    @property
+    def _range(self) -> Tensor:
+        span = self.q99 - self.q01
+        return torch.where(span == 0, EPSILON, span)

@@ -1,0 +1,221 @@
+"""Vision-language-action models: everything between an observation and a network, and between it and a robot.
+
+Flow matching runs from noise at time 1 to actions at time 0, as in K. Black et al., "π0: A Vision-Language-Action Flow
+Model for General Robot Control", arXiv 2410.24164.
+
+Shapes: B batch, C cameras, H by W pixels, k action chunk, D action components, A padded action, S padded state, R noisy
+copies, P tokens of the prefix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from vla.io.errors import UserError
+from vla.io.types import Shift, Steps, Text
+from vla.models.layers import Batch, mean_where
+from vla.models.model import Model, Prediction
+from vla.models.tokenizers.tokenizer import ActionTokenizer
+from vla.models.vlm.network import FlowNetwork, Prefix
+from vla.models.vlm.normalizer import Kind, Normalizer
+from vla.models.vlm.packed_linear import pack
+from vla.models.vlm.prompt import PADDING, Prompt
+from vla.models.vlm.trunk import Trunk
+from vla.spec import Spec
+
+SHAPE = 1.5  # first parameter of the beta distribution of times; the second is 1
+MIN_TIME = 0.001  # of training
+
+Place = Literal["corner", "centre"]
+
+
+class VisionLanguageAction(Model):
+    """A pretrained network that sees all cameras, reads the sentence and the state, and moves noise to actions.
+
+    Images, sentence and state are encoded once per plan. Rates of change in the state are left out.
+
+    Args:
+        network: factory of the network.
+        text: factory of its prompt.
+        trunk: folder with pretrained weights, or their name on the hub, hub:OWNER/NAME or hub:OWNER/NAME@REVISION:
+            those of the vision-language model alone, or of a whole policy of LeRobot; null: all weights are random.
+        cameras: what the pretrained policy calls a camera → the camera of the demonstrations, null for none; null: the
+            cameras of the demonstrations in their order.
+        chunk: k.
+        execute: number of the k actions that a policy executes before it predicts again; null: all.
+        steps: Euler steps from noise to actions.
+        copies: R, number of noisy copies of each chunk in a training batch, which share its prefix.
+        normalization: of state and actions.
+        statistics: whose they are normalised by, those of the demonstrations or of the pretrained policy.
+        place: where images of another aspect ratio lie in the square of the network.
+        shift: largest random shift of the training images, vertical and horizontal [1/256 of the image height].
+
+    Raises:
+        UserError: state or actions have too many components, a camera is unknown, or the trunk does not fit.
+    """
+
+    uses_tokens = False
+
+    noise: Tensor
+
+    def __init__(
+        self,
+        network: Callable[[], FlowNetwork],
+        text: Callable[..., Prompt],
+        trunk: Text | None,
+        cameras: dict[str, str | None] | None,
+        chunk: Steps,
+        execute: Steps | None,
+        steps: Steps,
+        copies: Steps,
+        normalization: Kind,
+        statistics: Literal["demonstrations", "pretrained"],
+        place: Place,
+        shift: Shift,
+        *,
+        spec: Spec,
+        tokenizer: ActionTokenizer,
+    ) -> None:
+        widths = {"text_width": 1, "width": 1, "auxiliary": 0.0}
+        super().__init__(text, chunk=chunk, execute=execute, shift=shift, spec=spec, tokenizer=tokenizer, **widths)
+        self.steps, self.copies, self.place, self.statistics = steps, copies, place, statistics
+        origin = None if trunk is None else Trunk(trunk)
+        self.cameras = _cameras(cameras, spec, origin)
+        self.network = network() if origin is None else origin.build(network)
+        pack(self.network)
+        _require_width("state", len(spec.pose), self.network.state_width or len(spec.pose))
+        _require_width("action", len(spec.action), self.network.action_width)
+        self.state_normalizer = Normalizer(normalization, len(spec.pose))
+        self.action_normalizer = Normalizer(normalization, len(spec.action))
+        if statistics == "pretrained" and origin:
+            known = origin.statistics()
+            self.state_normalizer.take(known, "observation.state", trunk)
+            self.action_normalizer.take(known, "action", trunk)
+        size = (chunk, self.network.action_width)
+        noise = torch.randn(size, generator=torch.Generator().manual_seed(0))
+        self.register_buffer("noise", noise, persistent=False)
+
+    def fit(self, states: np.ndarray, actions: np.ndarray) -> None:
+        """Normalise by the statistics of (N, P) states and (N, D) actions, unless they are those of the trunk."""
+        if self.statistics == "demonstrations":
+            self.state_normalizer.fit(states[:, self.spec.pose])
+            self.action_normalizer.fit(actions)
+
+    def sample_noise(self, random: torch.Generator) -> Tensor:
+        """Sample standard normal noise, (1, k, A)."""
+        return torch.randn(1, *self.noise.shape, generator=random)
+
+    def prefix(self, batch: Batch) -> Prefix:
+        """Encode the newest frame and the sentence."""
+        images = torch.stack([self.image(batch["rgb"][camera][:, -1]) for camera in self.cameras], 1)
+        present = images.new_ones(images.shape[:2], dtype=torch.bool)
+        state = self.state_normalizer(batch["state"][:, -1].index_select(-1, self.robot_state.pose))
+        tokens = self.text(batch["text"], state)
+        width = self.network.state_width
+        padded = F.pad(state, (0, width - state.shape[-1])) if width else None
+        return self.network.prefix(images, present, tokens.clamp(min=0), tokens != PADDING, padded)
+
+    def image(self, image: Tensor) -> Tensor:
+        """Convert (B, H, W, 3) uint8 images to (B, 3, resolution, resolution) float32 in -1 … 1."""
+        size = self.network.resolution
+        x = resize_with_padding(image.permute(0, 3, 1, 2).float() / 255, size, self.place)
+        return 2 * x - 1
+
+    def noised(self, batch: Batch) -> Batch:
+        """Return a batch with "noise", (R·B, k, A), and "time", (R·B,), which outside training are always the same."""
+        generator = None if self.training else torch.Generator().manual_seed(0)
+        count = self.copies * len(batch["state"])
+        noise = torch.randn(count, *self.noise.shape, generator=generator)
+        uniform = torch.rand(count, generator=generator)
+        time = MIN_TIME + (1 - MIN_TIME) * uniform ** (1 / SHAPE)  # uniform ** (2 / 3) ~ Beta(1.5, 1)
+        return {**batch, "noise": noise.to(self.noise), "time": time.to(self.noise)}
+
+    def loss(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the scalar `loss` at the noise and times of the batch, or at random ones, and its parts by name."""
+        return super().loss(batch if "time" in batch else self.noised(batch))
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        """Return velocity and target, (R·B, k, A) each."""
+        copies = len(batch["time"]) // len(batch["state"])
+        prefix = repeated(self.prefix(batch), copies)
+        action = self.padded(batch["action"][:, -1]).repeat(copies, 1, 1)
+        noise, time = batch["noise"], batch["time"][:, None, None]
+        velocity = self.network.velocity(prefix, time * noise + (1 - time) * action, batch["time"])
+        return {"velocity": velocity, "target": noise - action}
+
+    def padded(self, action: Tensor) -> Tensor:
+        """Normalise (…, D) actions, and pad them to (…, A)."""
+        return F.pad(self.action_normalizer(action), (0, self.network.action_width - action.shape[-1]))
+
+    def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
+        """Return the mean squared error of the velocity of valid actions, without padding."""
+        components = len(self.spec.action)
+        error = (output["velocity"] - output["target"])[..., :components].square().mean(-1)
+        return {"action_loss": mean_where(error, batch["valid"][:, -1].repeat(len(error) // len(batch["valid"]), 1))}
+
+    def predict(self, batch: Batch) -> Prediction:
+        """Move the "noise" of the batch, or else a fixed noise, to actions."""
+        prefix = self.prefix(batch)
+        noise = batch["noise"] if "noise" in batch else self.noise.expand(len(prefix.present), -1, -1)
+        x = noise
+        for step in range(self.steps):
+            time = x.new_full((len(x),), 1 - step / self.steps)
+            x = x - self.network.velocity(prefix, x, time) / self.steps
+        return Prediction(self.action_normalizer.inverse(x[..., : len(self.spec.action)]))
+
+
+def resize_with_padding(images: Tensor, size: int, place: Place) -> Tensor:
+    """Resize (B, 3, H, W) float images to (B, 3, size, size), bilinear, with black borders for other aspect ratios.
+
+    They are not antialiased, because the pretrained policies have seen them so: in the bottom right "corner", or in the
+    "centre".
+    """
+    height, width = images.shape[2:]
+    ratio = max(width / size, height / size)
+    rows, columns = int(height / ratio), int(width / ratio)
+    x = F.interpolate(images, (rows, columns), mode="bilinear", align_corners=False)
+    top, left = (size - rows, size - columns) if place == "corner" else ((size - rows) // 2, (size - columns) // 2)
+    return F.pad(x, (left, size - columns - left, top, size - rows - top))
+
+
+def repeated(prefix: Prefix, copies: int) -> Prefix:
+    """Repeat the rows of a prefix."""
+    if copies == 1:
+        return prefix
+    keys, values = (tuple(part.repeat(copies, 1, 1, 1) for part in parts) for parts in (prefix.keys, prefix.values))
+    return Prefix(keys, values, prefix.present.repeat(copies, 1))
+
+
+def _require_width(what: str, components: int, width: int) -> None:
+    if components > width:
+        raise UserError(f"the {what} has {components} components, and model.network.{what}_width={width} are too few")
+
+
+def _cameras(named: dict[str, str | None] | None, spec: Spec, trunk: Trunk | None) -> list[str]:
+    """Return the cameras of the spec in the order in which the network sees them.
+
+    Raises:
+        UserError: one is unknown, or one of the pretrained policy has no counterpart.
+    """
+    seen, ours = trunk.cameras if trunk else [], ", ".join(spec.cameras)
+    if named is None:
+        if seen and seen != [*spec.cameras]:
+            raise UserError(
+                f"{trunk} sees {', '.join(seen)}, and the demonstrations have {ours}: say which is which, null for "
+                f"none, as in 'model.cameras={{{seen[0]}: {spec.cameras[0]}, …}}'"
+            )
+        return [*spec.cameras]
+    if missing := [camera for camera in seen if camera not in named]:
+        raise UserError(f"model.cameras has no counterpart of {', '.join(missing)}, which {trunk} sees: null for none")
+    chosen = [camera for camera in named.values() if camera is not None]
+    if unknown := [camera for camera in chosen if camera not in spec.cameras]:
+        raise UserError(f"model.cameras names {', '.join(unknown)}, and the demonstrations have {ours}")
+    if not chosen:
+        raise UserError(f"model.cameras names none of the cameras of the demonstrations, {ours}")
+    return chosen

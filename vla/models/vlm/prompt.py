@@ -1,0 +1,131 @@
+"""Prompts: sentences, and for some models the state, as tokens of a pretrained language model.
+
+Shapes: B sentences, L tokens, S components of the state, W tokens of the longest number.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vla.io.documents import lines_of
+from vla.io.errors import UserError
+from vla.io.types import Steps, Text
+from vla.models.hub import fetch
+from vla.models.text.ngrams import TextEncoder
+
+PADDING = -1
+FILE = "tokenizer.json"
+BINS = 256  # of a normalised state in -1 … 1
+TRIED = "Task: pick it up, State: -1 0 255;\nAction: "
+
+
+class Prompt(TextEncoder):
+    """A sentence as a line of its own, cut to L tokens.
+
+    With `state` it is "Task: SENTENCE, State: NUMBERS;\\nAction: ", as π0.5 has it: the numbers of bins of the state.
+    Their tokens are looked up and inserted where the state is, so that there is no text to read again at every plan.
+
+    Args:
+        name: folder with the tokenizer.json of the language model, or its name on the hub, OWNER/NAME or
+            OWNER/NAME@REVISION; null: the tokens are the bytes of the text.
+        length: L.
+        state: whether the state is part of the prompt.
+        width: unused.
+
+    Raises:
+        UserError: there is no such tokenizer.
+    """
+
+    numbers: Tensor  # (BINS + 1, W) tokens of " -1" to " 255"
+    end: Tensor  # tokens after the numbers
+
+    def __init__(self, name: Text | None, length: Steps, state: bool, *, width: int) -> None:
+        super().__init__(width)
+        self.name, self.length, self.state = name, length, state
+        self._tokenizer, self._sha256 = (None, None) if name is None else _tokenizer(name)
+        if state:
+            bare = [self._ids(f" {number}", special=False) for number in range(-1, BINS)]
+            self.register_buffer("numbers", _padded(bare, max(map(len, bare))), persistent=False)
+            self.register_buffer("end", torch.tensor(self._ids(";\nAction: ", special=False)), persistent=False)
+            pieces = [
+                self._ids("Task: pick it up, State:", special=True),
+                bare[0],
+                bare[1],
+                bare[-1],
+                self.end.tolist(),
+            ]
+            if [token for piece in pieces for token in piece] != self._ids(TRIED, special=True):
+                raise UserError(
+                    f"the tokenizer of {name} does not read numbers one by one, as the prompt {TRIED!r} needs"
+                )
+
+    def tokenize(self, sentences: list[str]) -> Tensor:
+        """Return (B, L) int64 tokens, `PADDING` after the end."""
+        texts = [
+            f"Task: {_clean(each)}, State:" if self.state else each.removesuffix("\n") + "\n" for each in sentences
+        ]
+        return _padded([self._ids(text, special=True)[: self.length] for text in texts], self.length)
+
+    def forward(self, tokens: Tensor, state: Tensor | None = None) -> Tensor:
+        """Return the (B, L) tokens of whole prompts for the output of `tokenize` and the (B, S) normalised state."""
+        if not self.state:
+            return tokens
+        assert state is not None
+        edges = torch.arange(BINS, device=state.device) * (2 / BINS) - 1
+        bins = torch.bucketize(state.contiguous(), edges, right=True)  # 0 is below -1
+        parts = [tokens, self.numbers[bins].flatten(1), self.end.expand(len(tokens), -1)]
+        joined = torch.cat(parts, 1)
+        order = torch.sort((joined == PADDING).int(), dim=1, stable=True).indices  # what is no padding comes first
+        return joined.gather(1, order)[:, : self.length]
+
+    def _ids(self, text: str, special: bool) -> list[int]:
+        if self._tokenizer is None:
+            return list(text.encode())
+        return self._tokenizer.encode(text, add_special_tokens=special).ids
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return what identifies the tokenizer."""
+        return {"sha256": self._sha256}
+
+    def set_extra_state(self, state: Any) -> None:
+        """Raise a UserError if the tokenizer is another than that of a training."""
+        trained = state.get("sha256") if isinstance(state, dict) else self._sha256
+        if trained != self._sha256:
+            raise UserError(f"the {FILE} of {self.name} is another than in training: its SHA-256 is not {trained}")
+
+
+def _clean(sentence: str) -> str:
+    return sentence.strip().replace("_", " ").replace("\n", " ")
+
+
+def _padded(rows: list[list[int]], length: int) -> Tensor:
+    return torch.tensor([row + [PADDING] * (length - len(row)) for row in rows])
+
+
+def _tokenizer(name: str) -> tuple[Any, str]:
+    """Return the tokenizer in a folder or on the hub, and the SHA-256 of its file."""
+    from tokenizers import Tokenizer
+
+    folder, (repository, _, revision) = Path(name), name.partition("@")
+    if not folder.is_dir():
+        try:
+            folder = fetch(repository, FILE, revision=revision or None)
+        except OSError as error:
+            raise UserError(
+                f"model.text.name={name} is no folder here, and cannot be fetched from the Hugging Face hub ({error}): "
+                f"give a folder with its {FILE}"
+            ) from error
+    path = folder / FILE
+    try:
+        content = path.read_bytes()
+        tokenizer = Tokenizer.from_buffer(content)
+    except Exception as error:  # tokenizers raises Exception itself
+        raise UserError(f"{path} is no tokenizer: {lines_of(error)[0][:200]}") from error
+    tokenizer.no_padding()
+    tokenizer.no_truncation()
+    return tokenizer, hashlib.sha256(content).hexdigest()

@@ -1,0 +1,228 @@
+"""SmolVLA: a small vision-language model and an expert beside it, layer by layer.
+
+M. Shukor et al., "SmolVLA: A Vision-Language-Action Model for Affordable and Efficient Robotics", arXiv 2506.01844.
+
+Shapes: B batch, C cameras, L tokens of the sentence, N tokens of any kind, P tokens of the prefix, k action chunk, A
+components of a padded action, E width of the trunk, F width of the expert, H width of a head, S padded state.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from transformers import LlamaConfig, LlamaModel, SmolVLMConfig, SmolVLMModel
+from transformers.models.llama.modeling_llama import LlamaAttention, apply_rotary_pos_emb
+
+from vla.io.errors import UserError
+from vla.io.types import Count, Layers, Width
+from vla.models.vlm.network import FlowNetwork, Prefix
+
+ROPE_BASE = 10_000.0  # of the policy, whatever that of the language model was
+MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the time embedding
+EPSILON = 1e-5  # of RMS norms
+
+Rotation = tuple[Tensor, Tensor]  # cosines and sines of positions, (B, N, H) each
+
+
+class SmolVLA(FlowNetwork):
+    """The first layers of SmolVLM2 and an expert of equally many layers, which reads the keys and values of theirs.
+
+    In every layer whose number is a multiple of `joint_every`, actions attend to the prefix and causally to themselves;
+    in the others to the prefix alone, through projections of its keys and values that are computed once per plan. In
+    the prefix, images and sentence see each other, and the state, which comes last, sees all.
+
+    Args:
+        vocabulary: number of tokens of the sentence.
+        width, layers, heads, key_heads, head_width, feedforward: of the language model; several heads share a key head.
+        vision_width, vision_layers, vision_heads, vision_feedforward: of the image encoder, a vision transformer.
+        resolution: height and width of an image [px].
+        patch: height and width of a patch [px].
+        shuffle: so many by so many neighbouring patches become one token.
+        expert_width, expert_feedforward: of the expert, whose heads are those of the language model.
+        joint_every: 1: no layer attends to the prefix alone.
+        state_width: S.
+        action_width: A.
+
+    Raises:
+        UserError: sizes do not divide each other.
+    """
+
+    kind = "smolvla"
+    published = (
+        ("model.vlm_with_expert.vlm.model.", "vlm."),
+        ("model.vlm_with_expert.lm_expert.", "expert."),
+        ("model.", ""),
+    )
+    pretrained = (("model.", "vlm."),)
+    unused = ("model.vlm_with_expert.vlm.lm_head.",)
+
+    def __init__(
+        self,
+        vocabulary: Count,
+        width: Width,
+        layers: Layers,
+        heads: Layers,
+        key_heads: Layers,
+        head_width: Width,
+        feedforward: Width,
+        vision_width: Width,
+        vision_layers: Layers,
+        vision_heads: Layers,
+        vision_feedforward: Width,
+        resolution: Count,
+        patch: Count,
+        shuffle: Count,
+        expert_width: Width,
+        expert_feedforward: Width,
+        joint_every: Layers,
+        state_width: Width,
+        action_width: Width,
+    ) -> None:
+        super().__init__()
+        _require_multiple("heads", heads, "key_heads", key_heads)
+        _require_multiple("vision_width", vision_width, "vision_heads", vision_heads)
+        _require_multiple("resolution", resolution, "patch times shuffle", patch * shuffle)
+        _require_multiple("head_width", head_width, "two", 2)
+        _require_multiple("expert_width", expert_width, "two", 2)
+        self.resolution, self.state_width, self.action_width = resolution, state_width, action_width
+        self.head_width, self.joint_every = head_width, joint_every
+        attention = {"num_attention_heads": heads, "num_key_value_heads": key_heads, "head_dim": head_width}
+        shared = {**attention, "num_hidden_layers": layers, "rms_norm_eps": EPSILON}
+        shared |= {"bos_token_id": None, "eos_token_id": None}
+        text = {"hidden_size": width, "intermediate_size": feedforward, "vocab_size": vocabulary}
+        vision = {"hidden_size": vision_width, "num_hidden_layers": vision_layers, "num_attention_heads": vision_heads}
+        vision |= {"intermediate_size": vision_feedforward, "image_size": resolution, "patch_size": patch}
+        # Heads need not fill the width of the expert, which the check of its configuration demands.
+        expert = LlamaConfig(**shared, hidden_size=heads, intermediate_size=expert_feedforward, vocab_size=1)
+        expert.hidden_size = expert_width
+        trunk = {"model_type": "llama", **shared, **text}
+        self.vlm = SmolVLMModel(SmolVLMConfig(text_config=trunk, vision_config=vision, scale_factor=shuffle))
+        self.expert = LlamaModel(expert)
+        del self.expert.embed_tokens  # its input is no text
+        for number, layer in enumerate(self.expert.layers):
+            layer.self_attn = ExpertAttention(expert, number, joint=number % joint_every == 0)
+        self.state_proj = nn.Linear(state_width, width)
+        self.action_in_proj = nn.Linear(action_width, expert_width)
+        self.action_out_proj = nn.Linear(expert_width, action_width)
+        self.action_time_mlp_in = nn.Linear(2 * expert_width, expert_width)
+        self.action_time_mlp_out = nn.Linear(expert_width, expert_width)
+
+    def options(self) -> dict[str, Any]:
+        """Return LeRobot's options of this network; the width of the expert is a factor of that of the trunk."""
+        ratio = self.action_in_proj.out_features / self.state_proj.out_features
+        layers = {"num_vlm_layers": len(self.expert.layers), "self_attn_every_n_layers": self.joint_every}
+        return {**layers, "expert_width_multiplier": ratio, "resize_imgs_with_padding": [self.resolution] * 2}
+
+    def prefix(self, images: Tensor, cameras: Tensor, tokens: Tensor, sentence: Tensor, state: Tensor | None) -> Prefix:
+        """Encode images, sentence and state; every layer of the expert gets keys and values as it uses them."""
+        assert state is not None
+        seen = self.vlm.connector(self.vlm.vision_model(pixel_values=images.flatten(0, 1)).last_hidden_state)
+        seen = seen.unflatten(0, images.shape[:2])  # (B, C, N, E)
+        present = cameras.repeat_interleave(seen.shape[2], 1)
+        read = self.vlm.text_model.embed_tokens(tokens)
+        scale = math.sqrt(read.shape[-1])
+        hidden = torch.cat([seen.flatten(1, 2) * scale, read * scale, self.state_proj(state).unsqueeze(1)], 1)
+        present = torch.cat([present, sentence, sentence.new_ones(len(sentence), 1)], 1)  # (B, P)
+        mask = present[:, None, None, :].repeat(1, 1, present.shape[1], 1)  # (B, 1, P, P)
+        mask[:, :, :-1, -1] = False  # only the state sees the state
+        rotation, kept = rotation_of(present.cumsum(1) - 1, self.head_width), Kept()
+        for layer in self.vlm.text_model.layers:
+            hidden = layer(hidden, attention_mask=mask, position_embeddings=rotation, past_key_values=kept)
+        read_by = [layer.self_attn for layer in self.expert.layers]
+        pairs = [attention.read(*pair) for attention, pair in zip(read_by, kept.pairs, strict=True)]
+        return Prefix(tuple(keys for keys, _ in pairs), tuple(values for _, values in pairs), present)
+
+    def velocity(self, prefix: Prefix, noisy: Tensor, time: Tensor) -> Tensor:
+        """Predict the velocity of (B, k, A) noisy actions at times (B,) or (B, k)."""
+        hidden, count = self.action_in_proj(noisy), noisy.shape[1]
+        clock = time_embedding(time, hidden.shape[-1]).to(hidden.dtype)
+        clock = (clock if time.dim() == 2 else clock.unsqueeze(1)).expand_as(hidden)
+        hidden = self.action_time_mlp_out(F.silu(self.action_time_mlp_in(torch.cat([hidden, clock], -1))))
+        places = torch.arange(count, device=noisy.device)
+        after = rotation_of(prefix.present.sum(1, keepdim=True) + places, self.head_width)
+        first = rotation_of(places.unsqueeze(0), self.head_width)
+        known = prefix.present[:, None, None, :].expand(-1, 1, count, -1)
+        causal = (places[:, None] >= places).expand(len(noisy), 1, count, count)
+        joint = torch.cat([known, causal], -1)  # (B, 1, k, P + k)
+        for layer, keys, values in zip(self.expert.layers, prefix.keys, prefix.values, strict=True):
+            mask, rotation = (joint, after) if layer.self_attn.joint else (known, first)
+            hidden = layer(hidden, attention_mask=mask, position_embeddings=rotation, prefix=(keys, values))
+        return self.action_out_proj(self.expert.norm(hidden).float())
+
+
+class ExpertAttention(LlamaAttention):
+    """Attention of actions to the prefix, and if it is `joint` to themselves, which have keys and values then."""
+
+    def __init__(self, config: LlamaConfig, layer: int, *, joint: bool) -> None:
+        super().__init__(config, layer)
+        self.joint = joint
+        if not joint:
+            width = config.num_key_value_heads * self.head_dim
+            self.k_proj, self.v_proj = (nn.Linear(width, width, bias=False) for _ in range(2))
+
+    def read(self, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return keys and values of the prefix, (B, heads, P, H) each, as `forward` takes them, given the trunk's."""
+        if self.joint:
+            return keys, values
+        return self._by_head(self.k_proj(_flat(keys))), self._by_head(self.v_proj(_flat(values)))
+
+    def forward(
+        self,
+        hidden_states: Tensor,
+        position_embeddings: Rotation,
+        attention_mask: Tensor,
+        prefix: tuple[Tensor, Tensor],
+        **_: Any,
+    ) -> tuple[Tensor, None]:
+        """Attend from (B, k, F) with a (B, 1, k, P) mask, or (B, 1, k, P + k) if it is joint."""
+        query, (keys, values) = self._by_head(self.q_proj(hidden_states)), prefix
+        own = self._by_head(self.k_proj(hidden_states)) if self.joint else query
+        query, own = apply_rotary_pos_emb(query, own, *position_embeddings)
+        if self.joint:
+            keys = torch.cat([keys, own], 2)
+            values = torch.cat([values, self._by_head(self.v_proj(hidden_states))], 2)
+        attended = F.scaled_dot_product_attention(query, keys, values, attention_mask, enable_gqa=True)
+        return self.o_proj(_flat(attended)), None
+
+    def _by_head(self, features: Tensor) -> Tensor:
+        return features.unflatten(-1, (-1, self.head_dim)).transpose(1, 2)
+
+
+class Kept:
+    """Keys and values of every layer, where transformers has a cache."""
+
+    def __init__(self) -> None:
+        self.pairs: list[tuple[Tensor, Tensor]] = []
+
+    def update(self, keys: Tensor, values: Tensor, layer: int) -> tuple[Tensor, Tensor]:
+        """Keep those of the next layer."""
+        self.pairs.append((keys, values))
+        return keys, values
+
+
+def rotation_of(positions: Tensor, width: int) -> Rotation:
+    """Return the rotary embedding of (B, N) positions for heads of `width`."""
+    exponents = 2.0 / width * torch.arange(width // 2, dtype=torch.float32, device=positions.device)
+    angles = (positions.unsqueeze(-1).float() / ROPE_BASE**exponents).repeat(1, 1, 2)
+    return angles.cos(), angles.sin()
+
+
+def time_embedding(time: Tensor, width: int) -> Tensor:
+    """Embed times (…) in 0 … 1 as sines and cosines, (…, width) float64."""
+    steps = torch.linspace(0, 1, width // 2, dtype=torch.float64, device=time.device)
+    angles = time.unsqueeze(-1) * (1 / (MIN_PERIOD * (MAX_PERIOD / MIN_PERIOD) ** steps) * 2 * math.pi)
+    return torch.cat([angles.sin(), angles.cos()], -1)
+
+
+def _flat(by_head: Tensor) -> Tensor:
+    """Join the heads of (B, heads, N, H)."""
+    return by_head.transpose(1, 2).flatten(2)
+
+
+def _require_multiple(name: str, value: int, of: str, unit: int) -> None:
+    if value % unit:
+        raise UserError(f"model.network.{name}={value} must be a multiple of {of}, {unit}")

@@ -1,0 +1,155 @@
+"""Pretrained weights that lie elsewhere: of a vision-language model, or of a whole policy of LeRobot."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from vla.io.documents import lines_of, read_json
+from vla.io.errors import UserError
+from vla.models.trunk import Source
+from vla.models.trunk_folder import CONFIG, WEIGHTS, trunk_folder
+from vla.models.vlm.network import FlowNetwork, renamed
+from vla.parallel.limits import memory
+
+PREPROCESSOR = "policy_preprocessor.json"
+NORMALIZER = "normalizer_processor"  # its step
+IMAGES = "observation.images."
+# Options of LeRobot's policies that change what is computed → the only value that is known here.
+OPTIONS = {
+    **{"adapt_to_pi_aloha": False, "add_image_special_tokens": False, "attention_mode": "cross_attn"},
+    **{"num_expert_layers": -1, "prefix_length": -1, "use_relative_actions": False},
+}
+
+
+class Trunk:
+    """The folder of pretrained weights; they are read when a network is built.
+
+    Args:
+        name: a folder, or hub:OWNER/NAME or hub:OWNER/NAME@REVISION.
+
+    Raises:
+        UserError: there is none, it cannot be fetched, or its policy has options that are unknown here.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name, self.folder = name, trunk_folder(name)
+        self._config = read_json(self.folder / CONFIG, dict[str, Any])
+        self.is_policy = "input_features" in self._config  # of LeRobot, and not the vision-language model alone
+        for option, known in OPTIONS.items():
+            if self._config.get(option, known) != known:
+                raise UserError(f"{name} was trained with {option}={self._config[option]}, and only {known} is known")
+        self._files = sorted(self.folder.glob(WEIGHTS))
+        if not self._files:
+            raise UserError(f"{self.folder} has no weights, {WEIGHTS}: download the model again")
+
+    def __str__(self) -> str:
+        return self.name
+
+    @property
+    def source(self) -> Source:
+        """What identifies the weights."""
+        digest, revision = hashlib.sha256(), self.folder.name if self.folder.parent.name == "snapshots" else None
+        for path in self._files:
+            with path.open("rb") as file:
+                digest.update(hashlib.file_digest(file, "sha256").digest())
+        size = sum(path.stat().st_size for path in self._files)
+        return Source(self.name, revision, digest.hexdigest(), size)
+
+    @property
+    def cameras(self) -> list[str]:
+        """The cameras that the policy sees, in their order; empty for a vision-language model alone."""
+        features = self._config.get("input_features") or {}
+        return [name.removeprefix(IMAGES) for name, each in features.items() if each.get("type") == "VISUAL"]
+
+    def statistics(self) -> dict[str, Tensor]:
+        """Return those of the normaliser of the policy, such as action.mean; none if it has no normaliser."""
+        path = self.folder / PREPROCESSOR
+        steps = read_json(path, dict[str, Any]).get("steps", []) if path.is_file() else []
+        files = [step.get("state_file") for step in steps if step.get("registry_name") == NORMALIZER]
+        paths = [self.folder / Path(name).name for name in files if name]
+        return {name: tensor for path in paths if path.is_file() for name, tensor in _tensors([path])}
+
+    def build(self, network: Callable[[], FlowNetwork]) -> FlowNetwork:
+        """Build a network with these weights; what a vision-language model has no weights for is random.
+
+        Parts whose weights are all from here have their `source` as an attribute.
+
+        Raises:
+            UserError: a weight is missing, unknown or of another shape, or they need more than the memory.
+        """
+        with torch.device("meta"):
+            built = network()
+        own = dict(built.named_parameters())
+        if (needed := 4 * sum(weight.numel() for weight in own.values())) > memory():
+            raise UserError(
+                f"{self} needs {needed / 1e9:.1f} GB, and this machine has {memory() / 1e9:.1f} GB of memory"
+            )
+        found = dict[str, Tensor]()
+        for theirs, tensor in _tensors(self._files):
+            name = renamed(theirs, built.published if self.is_policy else built.pretrained)
+            if name in own:
+                if tensor.shape != own[name].shape:
+                    shapes = f"{[*tensor.shape]}, and the model has {[*own[name].shape]}"
+                    raise UserError(
+                        f"{theirs} in {self} has the shape {shapes}: its sizes are others, see model.network"
+                    )
+                found[name] = tensor.to(torch.float32, copy=True)
+            elif self.is_policy and not theirs.startswith(built.unused):
+                raise UserError(f"{self} has a weight that the model lacks, {theirs}: it is of another architecture")
+        parts = ("",) if self.is_policy else tuple(ours for _, ours in built.pretrained)
+        if missing := [name for name in own if name not in found and name.startswith(parts)]:
+            raise UserError(f"{self} lacks {missing[0]} and {len(missing) - 1} other weights of the model")
+        built.load_state_dict(found, strict=False, assign=True)
+        materialize(built)
+        source: Any = self.source
+        for part, module in built.named_modules():
+            names = [f"{part}.{name}".removeprefix(".") for name, _ in module.named_parameters()]
+            if names and found.keys() >= {*names}:
+                module.source = source
+        return built
+
+
+def materialize(network: nn.Module) -> None:
+    """Give all tensors on the device "meta" memory, and the values of an untrained network."""
+    for name, module in network.named_modules():
+        own = [*module.named_parameters(recurse=False), *module.named_buffers(recurse=False)]
+        if not any(tensor.is_meta for _, tensor in own):
+            continue
+        loaded = {key: tensor for key, tensor in own if not tensor.is_meta}
+        module.to_empty(device="cpu", recurse=False)
+        _initialize(network, name, module)
+        for key, tensor in loaded.items():
+            getattr(module, key).data = tensor.data
+
+
+@torch.no_grad()
+def _initialize(network: nn.Module, name: str, module: nn.Module) -> None:
+    """Initialise a module as the innermost model of transformers that it is part of does, or else as PyTorch does."""
+    while name:
+        name = name.rpartition(".")[0]
+        if callable(initialize := getattr(network.get_submodule(name), "_init_weights", None)):
+            return initialize(module)
+    reset: Any = module.reset_parameters
+    return reset()
+
+
+def _tensors(paths: list[Path]) -> Iterator[tuple[str, Tensor]]:
+    """Yield name and tensor of all that the files have; a UserError if one is damaged."""
+    from safetensors import safe_open
+
+    with ExitStack() as stack:
+        for path in paths:
+            try:
+                file = stack.enter_context(safe_open(path, "pt"))
+            except Exception as error:  # safetensors has errors of its own
+                raise UserError(f"{path} is damaged: {lines_of(error)[0][:200]}") from error
+            names: list[str] = file.keys()  # it is no mapping
+            for name in names:
+                yield name, file.get_tensor(name)
