@@ -48,7 +48,7 @@ class Motions:
 def make_batch(frames: int, chunk: int = 1, size: int = 4, spec: Spec = SPEC) -> dict[str, Any]:
     """A batch of `size` windows with random images and actions, and sentences that differ."""
     low, high = torch.tensor(spec.low), torch.tensor(spec.high)
-    return {
+    batch = {
         "rgb": {name: torch.randint(256, (size, frames, *spec.image_size, 3)).byte() for name in spec.cameras},
         "state": torch.randn(size, frames, len(spec.state)),
         "present": torch.ones(size, frames, dtype=torch.bool),
@@ -58,6 +58,7 @@ def make_batch(frames: int, chunk: int = 1, size: int = 4, spec: Spec = SPEC) ->
         "unperturbed": torch.ones(size, frames, dtype=torch.bool),
         "truth": torch.randn(size, frames, spec.truth_size),
     }
+    return {**batch, "executed": batch["action"]}
 
 
 def with_text(model: Model, batch: dict[str, Any]) -> dict[str, Any]:

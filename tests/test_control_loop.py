@@ -22,8 +22,8 @@ IMAGE = np.zeros((8, 8, 3), np.uint8)
 class World:
     """A simulated arm that follows its commands, two cameras, and a clock."""
 
-    def __init__(self, safety: Safety = SAFETY, follows_positions: bool = True) -> None:
-        self.loop = ControlLoop(SPEC, ROBOT, safety, 50.0, follows_positions)
+    def __init__(self, safety: Safety = SAFETY, follows_positions: bool = True, execute: int | None = None) -> None:
+        self.loop = ControlLoop(SPEC, ROBOT, safety, 50.0, follows_positions, execute)
         self.now, self.joints = 100.0, HOME.copy()
         self.cameras, self.measures, self.follows = ["front", "wrist"], True, True
         self.apart = 0.0  # delay of the wrist's images [s]
@@ -116,6 +116,33 @@ def test_a_chunk_is_executed_to_its_end_before_the_policy_is_asked_again() -> No
     world.run(1.2)
     assert np.diff(asked) == pytest.approx([0.4] * (len(asked) - 1), abs=0.021) and len(asked) >= 3
     np.testing.assert_allclose((world.tool - start)[0], 0.11, atol=0.015)
+
+
+def test_a_plan_to_continue_is_executed_until_the_next_one_is_there() -> None:
+    """The policy sees what remains of it, and how much of that will be over by then."""
+    world, asked, plans = World(execute=2), list[tuple[float, Observation]](), list[np.ndarray]()
+
+    def answer(observation: Observation) -> np.ndarray:
+        asked.append((world.now, observation))
+        plans.append(np.linspace(0.1, 0.8, 8)[:, None] * FORWARD + 0.01 * len(plans) * FORWARD)
+        return plans[-1].astype(np.float32)
+
+    world.answer = answer
+    world.loop.delays.add(0.12)
+    world.run(0.1)
+    world.loop.on_instruction("go", world.now)
+    world.run(1.2)
+    assert len(asked) >= 4 and np.diff([at for at, _ in asked]) == pytest.approx([0.2] * (len(asked) - 1), abs=0.021)
+    assert asked[0][1].running is None
+    for plan, (_, observation) in zip(plans, asked[1:], strict=False):
+        assert observation.running is not None and observation.running.delay == 2  # 0.12 s at 10 Hz
+        np.testing.assert_array_equal(observation.running.actions, plan[2:].astype(np.float32))
+    world.loop.on_instruction("", world.now)
+    world.loop.on_instruction("go on", world.now)
+    world.loop.resume(world.now)
+    del asked[:]
+    world.run(0.5)
+    assert asked[0][1].running is None  # what was dropped is not continued
 
 
 def test_a_late_answer_still_ends_where_and_when_it_should(world: World) -> None:

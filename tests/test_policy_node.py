@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from arm import ROBOT, SPEC
+from arm import FORWARD, ROBOT, SPEC
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from fake_batch import as_policy, make_bc
@@ -127,6 +127,21 @@ def test_of_a_chunk_as_much_is_executed_as_in_evaluation(world: World) -> None:
     world.policy.history, before = 2, len(world.policy.seen)
     world.live(1.5)
     assert len(world.policy.seen) - before >= 8  # of 15 frames: in training, those of a history have no gaps
+
+
+def test_a_chunk_that_the_next_one_continues_goes_on_meanwhile(make_world: Callable[..., World]) -> None:
+    world = make_world()
+    world.policy.chunk, world.policy.execute, world.policy.takes = 8, 2, 0.25
+    world.policy.chunking = object()
+    world.start()
+    assert world.becomes(State.RUNNING)
+    world.live(2.0)
+    assert (loop := world.agent.loop) is not None and loop.late_plans == 0
+    rests = [seen.running for seen in world.policy.seen if seen.running is not None]
+    assert len(rests) >= 2 and {rest.delay for rest in rests} <= {1, 2, 3, 4, 5} and rests[-1].delay >= 3
+    for rest in rests:
+        assert rest.delay <= len(rest.actions) <= 6
+        np.testing.assert_array_equal(rest.actions, np.repeat(FORWARD, len(rest.actions), 0))
 
 
 def test_a_policy_that_fails_is_a_fault_that_only_deactivation_ends(world: World) -> None:

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from itertools import cycle, takewhile
@@ -40,12 +40,13 @@ from vla.config.experiment import Experiment
 from vla.deploy.client_observation import Keys
 from vla.deploy.server import PolicyServer, Service
 from vla.io.array_messages import DTYPES, LARGEST_MAP, LONGEST_LIST, pack, unpack
+from vla.models.chunking import TrainedPrefix
 from vla.models.flow import Flow
 from vla.models.model import Model
 from vla.policy import Policy
 from vla.rollouts.evaluate import play_episode
 from vla.rollouts.remote import Component, RemotePolicy
-from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Array, Observation
+from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Array, Observation, Running
 
 TEXTS = ("go", "lift it now", "go", "put it down")
 KEYS = Keys({"eye": "observation/image"}, ["observation/state"], "prompt")
@@ -190,6 +191,43 @@ def test_clients_act_as_if_they_were_alone_bit_for_bit(make: Callable[[], Model]
         alone = as_policy(policy.model, lanes=rows)
         alone.reset(TEXTS[seed], seed)
         np.testing.assert_array_equal(results[seed][1:], [alone.plan(each) for each in stream])
+
+
+def test_a_plan_goes_on_from_the_one_that_a_client_executes() -> None:
+    model = make_denoising(Flow, chunk=8, execute=2, prefix=4)
+    policy, seen = as_policy(model, chunking=TrainedPrefix()), observations(5)
+    expected, plans = as_policy(model, chunking=TrainedPrefix()), list[Array]()
+    with serving(policy) as url, closing(remote(url)) as agent:
+        assert agent.metadata["chunking"] is True
+        agent.reset(seen[0].instruction, 0)
+        acted = [agent.act(observation) for observation in seen]
+        for number in (0, 2, 4):  # without delay nothing is certain, and two actions of each plan are executed
+            running = Running(plans[-1][2:], 0) if plans else None
+            plans.append(expected.plan(replace(seen[number], running=running)))
+        np.testing.assert_array_equal(acted, [*plans[0][:2], *plans[1][:2], plans[2][0]])
+        late = replace(seen[0], running=Running(plans[2][1:], 3))
+        np.testing.assert_array_equal(agent.plan(late)[:3], plans[2][1:4])
+        mapped = {name: Component(index, 1.0, 0.0) for index, name in enumerate(SPEC.action)}
+        with closing(remote(url, actions=mapped)) as other:
+            assert "running" not in other.message(late)
+    with serving(as_policy(make_bc())) as url, closing(remote(url)) as agent:
+        assert agent.metadata["chunking"] is False and "running" not in agent.message(late)
+
+
+@pytest.mark.parametrize(
+    ("running", "sentence"),
+    [
+        ([], r"running/actions is a plan \(n, 3\), not None"),
+        ({"actions": np.zeros((2, 2), np.float32), "delay": 0}, r"running/actions is a plan \(n, 3\)"),
+        ({"actions": np.zeros((0, 3), np.float32), "delay": 0}, r"\(n, 3\), not \(0, 3\)"),
+        ({"actions": np.full((2, 3), np.nan, np.float32), "delay": 0}, "running/actions holds a number that is not"),
+        ({"actions": np.zeros((2, 3), np.float32), "delay": 3}, "running/delay is 3, expected an integer from 0 to 2"),
+        ({"actions": np.zeros((2, 3), np.float32), "delay": True}, "running/delay is True"),
+    ],
+)
+def test_a_plan_that_is_none_is_refused(running: Any, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        KEYS.observation({**message(observations(1)[0]), "running": running}, SPEC)
 
 
 def test_a_reset_begins_another_episode() -> None:

@@ -46,6 +46,7 @@ class Forward:
 
     spec = SPEC
     execute = history = 1
+    chunking: object = None
 
     def __init__(self) -> None:
         self.seen: list[Observation] = []

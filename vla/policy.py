@@ -18,13 +18,15 @@ from torch import Tensor
 
 from vla.io.errors import UserError
 from vla.io.types import Count
+from vla.models.chunking import Chunking, require_chunking
 from vla.models.compile_cache import set_compile_cache
 from vla.models.layers import Batch
 from vla.models.model import Model
 from vla.schedule import Schedule
-from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Spec
+from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Running, Spec
 
 Seen = Observation | Mapping[str, Any] | Sequence[Observation]  # by one lane, or by several
+NOTHING = Running(np.empty((0, 1), np.float32), 0)  # no plan is executed
 LONG_SENTENCE = " ".join(["sentence"] * 24)  # shorter instructions are padded to it for a constant shape
 
 
@@ -56,11 +58,12 @@ class Policy:
         compile: compile the model, which takes up to a minute at the first action and needs g++ on a CPU. On a GPU
             CUDA graphs are used. Weights stay inputs of the graphs, so that models of one class share them.
         lanes: rows of every pass through the model.
+        chunking: how plans continue those that `Observation.running` says are executed meanwhile; None: they do not.
         model: the network, with its tokenizer.
         spec: observation and action spaces.
 
     Raises:
-        UserError: device="cuda" without a GPU.
+        UserError: device="cuda" without a GPU, or a `chunking` that the model cannot do.
     """
 
     def __init__(
@@ -69,6 +72,7 @@ class Policy:
         precision: Literal["fp32", "bf16"],
         compile: bool,
         lanes: Count,
+        chunking: Chunking | None = None,
         *,
         model: Model,
         spec: Spec,
@@ -78,6 +82,10 @@ class Policy:
         available = "cuda" if torch.cuda.is_available() else "cpu"
         self.device = torch.device(available if device == "auto" else device)
         self.model, self.spec, self.lanes = model.eval().to(self.device), spec, lanes
+        self.chunking = chunking
+        if chunking is not None:
+            require_chunking(type(chunking), type(model), model.prefix)
+            model.chunking = chunking
         self.execute = model.execute  # number of actions of a chunk to execute
         self.history = model.history  # number of frames it looks at; with several it wants to see every one
         self._bf16 = precision == "bf16"
@@ -135,7 +143,10 @@ class Policy:
             return self.act([self._one(observations)], [0])[0]
         seen = self._followed(observations, lanes)
         self._observe({lane: each for lane, each in seen.items() if self.looking(lane)})
-        for lane, chunk in self._predict([lane for lane in lanes if self._wants_plan(lane)]).items():
+        wanting = {lane: self._lanes[lane] for lane in lanes if self._wants_plan(lane)}
+        rests = {lane: [action for action, _ in each.schedule.remaining(each.step)] for lane, each in wanting.items()}
+        running = {lane: Running(np.reshape(rest, (-1, len(self._low))), 0) for lane, rest in rests.items()}
+        for lane, chunk in self._predict(running).items():
             self._lanes[lane].schedule.add(chunk, self._lanes[lane].step)
         chosen = []
         for state in (self._lanes[lane] for lane in lanes):
@@ -151,8 +162,9 @@ class Policy:
         """
         if lanes is None:
             return self.plan([self._one(observations)], [0])[0]
-        self._observe(self._followed(observations, lanes))
-        planned = self._predict(lanes)
+        seen = self._followed(observations, lanes)
+        self._observe(seen)
+        planned = self._predict({lane: each.running or NOTHING for lane, each in seen.items()})
         return np.stack([[action for action, _ in planned[lane]] for lane in lanes])
 
     def _one(self, seen: Any) -> Observation:
@@ -180,13 +192,19 @@ class Policy:
             for row, lane in rows.items():
                 self._lanes[lane].frames.append({name: values[row : row + 1] for name, values in kept.items()})
 
-    def _predict(self, lanes: Sequence[int]) -> dict[int, list[tuple[Array, dict[str, Any]]]]:
-        """Return lane → its chunk of clipped actions, (D,) each, with what is known about them."""
+    def _predict(self, lanes: Mapping[int, Running]) -> dict[int, list[tuple[Array, dict[str, Any]]]]:
+        """Return lane → its chunk of clipped actions, (D,) each, with what is known about them.
+
+        Those of its running plan that are over by then come first.
+        """
         chunks = {}
-        for rows, windows in self._passes({lane: self._inputs(lane) for lane in lanes}):
+        for rows, windows in self._passes({lane: self._inputs(lane, plan) for lane, plan in lanes.items()}):
             with self._computing():
                 predicted, probabilities = self._predict_chunk(windows)
             actions = np.clip(predicted.float().cpu().numpy(), self._low, self._high)
+            for row, lane in rows.items() if self.chunking else ():
+                certain = lanes[lane].actions[: lanes[lane].delay][: len(actions[row])]
+                actions[row, : len(certain)] = certain
             infos: list[list[dict[str, Any]]] = [[{} for _ in chunk] for chunk in actions]
             if probabilities is not None:
                 infos = [[{"probabilities": each} for each in of] for of in probabilities.float().cpu().numpy()]
@@ -216,10 +234,19 @@ class Policy:
         with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
             yield
 
-    def _inputs(self, lane: int) -> Batch:
-        """Return the input of one prediction, with the next noise if the model needs any."""
-        noise = self.model.sample_noise(self._lanes[lane].random)
-        return self.window(lane) if noise is None else {**self.window(lane), "noise": noise.to(self.device)}
+    def _inputs(self, lane: int, running: Running) -> Batch:
+        """Return the input of one prediction, with the next noise and the running plan if the model needs them."""
+        inputs, noise = self.window(lane), self.model.sample_noise(self._lanes[lane].random)
+        if noise is not None:
+            inputs["noise"] = noise.to(self.device)
+        if self.chunking is not None:
+            rest = running.actions[: self.model.chunk]
+            padded = np.zeros((self.model.chunk, len(self._low)), np.float32)
+            padded[: len(rest)] = rest
+            counts = {"remaining": len(rest), "delay": min(running.delay, len(rest))}
+            inputs |= {name: torch.tensor([count], device=self.device) for name, count in counts.items()}
+            inputs["running"] = torch.from_numpy(padded)[None].to(self.device)
+        return inputs
 
     def window(self, lane: int = 0) -> Batch:
         """Return the model input of a lane, a batch of one: the frames so far, padded to the history of the model."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -54,10 +55,35 @@ class Schedule(Generic[Action]):
         """Drop all plans."""
         self._plans = []
 
+    def executed(self, execute: int) -> float:
+        """Return the time at which `execute` actions of the newest plan are over; -∞ without one."""
+        return self._plans[-1].start + self._period * execute if self._plans else -math.inf
+
     def wants_plan(self, time: float, execute: int) -> bool:
         """Return whether `execute` actions of the newest plan are over, so that the next observation is due."""
-        return not self._plans or time >= self._plans[-1].start + self._period * execute
+        return time >= self.executed(execute)
+
+    def remaining(self, time: float) -> Sequence[Action]:
+        """Return the actions of the newest plan from a time on."""
+        return self._plans[-1].actions[bisect_right(self._plans[-1].ends, time) :] if self._plans else []
 
     def at(self, time: float) -> list[Action]:
         """Return the action of every plan that has one for a time, the newest last."""
         return [plan.actions[bisect_right(plan.ends, time)] for plan in self._plans if time < plan.ends[-1]]
+
+
+class Delays:
+    """Forecast of the delay of the next plan: the longest of the last ten, as in arXiv 2506.07339."""
+
+    def __init__(self, period: float) -> None:
+        """Count in actions of a `period` [s]."""
+        self._period, self._seconds = period, deque[float](maxlen=10)
+
+    def add(self, seconds: float) -> None:
+        """Add the time from an observation to its plan [s]."""
+        self._seconds.append(seconds)
+
+    @property
+    def longest(self) -> int:
+        """How many actions will be over when the next plan arrives."""
+        return math.ceil(max(self._seconds, default=0.0) / self._period - 1e-9)

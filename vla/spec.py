@@ -217,6 +217,14 @@ def _contradictions_of_robot(robot: RobotModel, spec: Spec) -> Iterator[str]:
 
 
 @dataclass(frozen=True)
+class Running:
+    """The rest of the plan that is executed while the next one is computed."""
+
+    actions: Array  # (n, D), the first of which begins at the time of the observation
+    delay: int  # how many of them, at most n, will be over when the next plan arrives
+
+
+@dataclass(frozen=True)
 class Observation:
     """Input of an agent at one step."""
 
@@ -225,6 +233,7 @@ class Observation:
     instruction: str
     depth: dict[str, Array] = field(default_factory=dict)  # camera → (H, W) uint16 [mm], 0: no return (ROS 16UC1)
     truth: dict[str, Array] | None = None  # simulator only: for experts, never for policies
+    running: Running | None = None  # for policies that continue it
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], spec: Spec) -> Observation:

@@ -64,7 +64,13 @@ def check(experiment: Experiment, job: Job) -> None:
         elif not group.optional:
             raise UserError(f"job={settings.job} needs {name}=OPTION; --help lists the options")
     if "model" in groups:
-        _require_together(*(locate(f"{group}._target_", config[group]["_target_"]) for group in ("tokenizer", "model")))
+        kinds = [locate(f"{group}._target_", config[group]["_target_"]) for group in ("tokenizer", "model")]
+        _require_together(*kinds)
+        if chunking := (config.get("policy") or {}).get("chunking"):
+            from vla.models.chunking import require_chunking  # imports PyTorch, as models do
+
+            method = locate("policy.chunking._target_", chunking["_target_"])
+            require_chunking(method, kinds[1], config["model"].get("prefix", 0))
     _check_contents(experiment, groups)
 
 

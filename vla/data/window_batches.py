@@ -109,8 +109,8 @@ class WindowBatcher:
         # Truth that this store lacks, and others beside it have.
         unknown = np.full((len(known[0]), self._truth_size - store.spec.truth_size), np.nan, np.float32)
         self._numbers = np.concatenate([*known, unknown], axis=1)
-        self._action = numbers["action"]
-        off = perturbed(self._action[:], numbers["executed"][:], store.spec)
+        self._action, self._executed = numbers["action"], numbers["executed"]
+        off = perturbed(self._action[:], self._executed[:], store.spec)
         self._perturbations = np.append(0, off.cumsum())  # before each row
         self._store, self._entries = store, (entries := store.episodes)
         self._verified = np.zeros(len(entries), bool)  # images only
@@ -152,6 +152,7 @@ class WindowBatcher:
         if self._truth_size:
             batch["truth"] = numbers[..., state:]
         batch["action"] = self._take(self._action, labels)
+        batch["executed"] = self._take(self._executed, labels)
         batch["present"] = self._own(present)
         batch["valid"] = self._own(valid)
         batch["unperturbed"] = self._own(self._perturbations[labels[:, :, -1]] == self._perturbations[frames])

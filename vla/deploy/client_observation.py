@@ -11,7 +11,7 @@ from annotated_types import MinLen
 
 from vla.io.errors import UserError
 from vla.io.types import Text
-from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Spec
+from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Running, Spec
 
 LARGEST_IMAGE = 4096  # pixels in a row or column
 
@@ -42,7 +42,8 @@ class Keys:
                 f"the state in {' and '.join(self.state)} has {len(state)} numbers, "
                 f"the policy needs {len(spec.state)}: {', '.join(spec.state)}"
             )
-        return Observation(images, state, instruction(self.prompt, found[self.prompt]))
+        said = instruction(self.prompt, found[self.prompt])
+        return Observation(images, state, said, running=_running(message.get("running"), spec))
 
 
 def _find(message: Mapping[Any, Any], key: str) -> Any:
@@ -83,6 +84,19 @@ def _vector(key: str, value: Any) -> Array:
     if not np.isfinite(vector).all():
         raise UserError(f"{key} holds a number that is not finite")
     return vector
+
+
+def _running(value: Any, spec: Spec) -> Running | None:
+    """Return the rest of the plan that a client executes."""
+    if value is None:
+        return None
+    said, width = value if isinstance(value, Mapping) else {}, len(spec.action)
+    actions, delay = said.get("actions"), said.get("delay")
+    if not isinstance(actions, np.ndarray) or actions.ndim != 2 or actions.shape[1] != width or not len(actions):
+        raise UserError(f"running/actions is a plan (n, {width}), not {getattr(actions, 'shape', None)}")
+    if type(delay) is not int or not 0 <= delay <= len(actions):
+        raise UserError(f"running/delay is {repr(delay)[:50]}, expected an integer from 0 to {len(actions)}")
+    return Running(_vector("running/actions", actions).reshape(actions.shape), delay)
 
 
 def instruction(key: str, value: Any) -> str:

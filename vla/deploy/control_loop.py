@@ -5,7 +5,7 @@ All times are seconds on one monotonic clock. Shapes: J joints, D action compone
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from vla.deploy.motion import Command, Goals, Motion
 from vla.deploy.observer import Measured, Observer
 from vla.deploy.safety import Safety, State, Tracking
 from vla.io.errors import UserError
-from vla.spec import Array, Observation, Spec
+from vla.schedule import Delays
+from vla.spec import Array, Observation, Running, Spec
 
 # How to recover, for messages.
 RESUME = 'python -m vla.deploy.say --resume "INSTRUCTION", or call ~/resume'
@@ -38,7 +39,13 @@ class ControlLoop:
     """Turns images, joint states and instructions into joint commands within limits; not thread-safe."""
 
     def __init__(
-        self, spec: Spec, limits: JointLimits, safety: Safety, command_hz: float, follows_positions: bool = True
+        self,
+        spec: Spec,
+        limits: JointLimits,
+        safety: Safety,
+        command_hz: float,
+        follows_positions: bool = True,
+        execute: int | None = None,
     ) -> None:
         """Args:
         spec: of the policy.
@@ -47,6 +54,7 @@ class ControlLoop:
         command_hz: commands per second [Hz].
         follows_positions: whether the arm goes where the commands say. Otherwise it goes its own way, as in a dry run,
             and the commands of every plan start at the measured pose.
+        execute: actions of a plan after which the next one is asked for, which continues it; None: at its end.
 
         Raises:
             UserError: the policy does not fit the arm or the command rate.
@@ -55,7 +63,7 @@ class ControlLoop:
             raise UserError(f"command_hz is {command_hz}, below the {spec.control_hz} actions/s of the policy")
         self.goals = Goals(spec, limits, safety.workspace)
         self.spec, self.limits, self.safety, self.tick = spec, limits, safety, 1 / command_hz
-        self._follows_positions = follows_positions
+        self._follows_positions, self._execute = follows_positions, execute
         self.restart()
 
     def restart(self) -> None:
@@ -66,6 +74,8 @@ class ControlLoop:
         self.motion = Motion(self.limits, self.tick, 1 / self.spec.control_hz, self.goals.workspace)
         self._observer, self._tracking = Observer(self.spec), Tracking(self.safety, self._follows_positions)
         self._pending: _Pending | None = None
+        self._planned = np.empty((0, len(self.spec.action)), np.float32)  # the actions in the schedule
+        self.delays = Delays(1 / self.spec.control_hz)  # from observations to their plans
         self.observed_at = -np.inf  # time stamp of the last observation
         self.resumed = True  # True if the last observation is the first since the loop started to run
         self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
@@ -159,10 +169,13 @@ class ControlLoop:
 
     def next_observation(self, now: float) -> Observation | None:
         """Return the observation for the policy if an inference is due; then call `set_plan` or `reject_plan`."""
-        observed = self._observer.due(self._last_observed, self.motion.schedule.end)
+        schedule = self.motion.schedule
+        observed = self._observer.due(
+            self._last_observed, schedule.end if self._execute is None else schedule.executed(self._execute)
+        )
         if self.state is not State.RUNNING or self._pending is not None or observed is None:
             return None
-        if self.motion.schedule.newest and now > self.motion.schedule.end + 0.5 / self.spec.control_hz:
+        if schedule.newest and now > schedule.end + 0.5 / self.spec.control_hz:
             self.late_plans += 1
         # Anchor on the pose commanded at that time. The measured pose lags behind it; the last goal runs ahead of an
         # arm that its limits slow down, and the policy would overshoot.
@@ -171,7 +184,11 @@ class ControlLoop:
             anchor = self._observer.measured_at(observed).joints
         self.resumed, self._last_observed, self.observed_at = np.isinf(self._last_observed), observed, observed
         self._pending = _Pending(now, observed, anchor)
-        return self._observer.observation(observed, self.instruction)
+        observation = self._observer.observation(observed, self.instruction)
+        rest = len(schedule.remaining(observed + 0.5 / self.spec.control_hz))  # an image may be early
+        if self._execute is None or not rest:
+            return observation
+        return replace(observation, running=Running(self._planned[-rest:], min(self.delays.longest, rest)))
 
     def set_plan(self, actions: Array) -> None:
         """Schedule the policy's actions (k, D); the first one starts at the time of the observation.
@@ -186,7 +203,7 @@ class ControlLoop:
         except UserError as error:
             return self._count_rejection(str(error))
         if self.state is State.RUNNING and not pending.outdated:
-            self.rejections = 0
+            self.rejections, self._planned = 0, actions
             # An arm that does not follow its commands is where it is measured, not where it was commanded.
             measured = None if self._follows_positions else self._observer.newest
             self.motion.follow(waypoints, None if measured is None else measured.joints)

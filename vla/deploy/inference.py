@@ -56,4 +56,6 @@ class Inference:
             self._policy.reset(observation.instruction, 0)
         plan = self._policy.plan(observation)
         # In training the frames of a history have no gaps either.
-        return plan[: 1 if getattr(self._policy, "history", 1) > 1 else self._policy.execute]
+        execute = 1 if getattr(self._policy, "history", 1) > 1 else self._policy.execute
+        # What the next plan continues goes on until that is there.
+        return plan if getattr(self._policy, "chunking", None) else plan[:execute]

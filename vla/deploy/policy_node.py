@@ -87,7 +87,9 @@ class PolicyNode(GuardedLifecycleNode):
         if twist and acts_on_joints(self.policy.spec):
             raise UserError("command=twist needs a policy of Cartesian actions, this one's are joint positions")
         follows_positions = not (settings.dry_run or twist)
-        loop = ControlLoop(self.policy.spec, self._limits, settings.safety, settings.command_hz, follows_positions)
+        policy, limits = self.policy, self._limits
+        execute = policy.execute if getattr(policy, "chunking", None) else None
+        loop = ControlLoop(policy.spec, limits, settings.safety, settings.command_hz, follows_positions, execute)
         if settings.gripper is not None and not loop.goals.has_gripper:
             raise UserError("deploy/gripper needs a policy that moves a gripper")
         if settings.gripper is not None and topics.gripper is None:
@@ -225,8 +227,10 @@ class PolicyNode(GuardedLifecycleNode):
             if (done := inference.take()) is not None:
                 plan, seconds = done
                 loop.set_plan(plan)
+                delay = time.monotonic() - loop.observed_at
+                loop.delays.add(delay)
                 self.diagnostics.record("inference", seconds)
-                self.diagnostics.record("image to command", time.monotonic() - loop.observed_at)
+                self.diagnostics.record("image to command", delay)
         except Exception as error:
             self.get_logger().error(f"the policy failed: {traceback.format_exc()}", throttle_duration_sec=1.0)
             loop.reject_plan(f"the policy failed: {error}")

@@ -230,7 +230,9 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
     """Describe the policy to a client: layouts, units and bounds, and how to use its chunks.
 
     `horizon` is the length of a chunk, of which a client executes the first `execute` actions; a policy with a
-    `history` of several frames wants to see every frame, so that the client sends an observation at every step.
+    `history` of several frames wants to see every frame, so that the client sends an observation at every step. With
+    `chunking`, an observation may have the plan that is `running`: its next `actions` (n, D), and how many of them, the
+    `delay`, will be over when the answer arrives.
     """
     spec = policy.spec
     action = {"names": list(spec.action), "units": list(spec.units)}
@@ -246,6 +248,7 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
         "horizon": policy.model.chunk,
         "execute": policy.execute,
         "history": policy.history,
+        "chunking": policy.chunking is not None,
         "reset": True,
     }
 

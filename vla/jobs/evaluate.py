@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from vla.config.annotations import locate
 from vla.config.build import Group, build
 from vla.config.experiment import Experiment
 from vla.config.nodes import NEAREST, with_changes
@@ -20,6 +21,7 @@ from vla.io.errors import UserError
 from vla.io.files import warn_on_error, writing
 from vla.io.printable import printable, show
 from vla.io.versions import installed_versions
+from vla.models.chunking import require_fit
 from vla.models.policy_folder import is_gone, require_unseen
 from vla.policy import costs
 from vla.reports.evaluation import plot_report, write_report
@@ -50,6 +52,7 @@ from vla.runs.folder import (
 )
 from vla.runs.played import Played
 from vla.runs.resume import cached_success, training_lock
+from vla.schedule import Delays
 from vla.spec import IN_DISTRIBUTION, Multitask
 
 log = logging.getLogger(__name__)
@@ -233,7 +236,12 @@ def require_possible(experiment: Experiment) -> None:
             require_unseen(name, "evaluate.seed", wanted.seeds)  # whatever `validate` is now
     _statements(experiment)
     for node in wanted.networks.values():
-        build(node, NETWORK)
+        network = build(node, NETWORK)
+        if (chunking := (experiment.nodes.get("policy") or {}).get("chunking")) and not experiment.nodes.get("agent"):
+            method = locate("policy.chunking._target_", chunking["_target_"])
+            delays = Delays(1 / experiment.world().spec.control_hz)
+            delays.add(network.latency + network.jitter)
+            require_fit(method, experiment["model"], delays.longest)
     if not experiment.playable and wanted.conditions:
         raise UserError("evaluate.conditions change a world, and a recording has none: omit them")
     if wanted.nearest is not None:

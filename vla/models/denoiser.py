@@ -16,10 +16,11 @@ from torch import Tensor, nn
 
 from vla.io.errors import UserError
 from vla.io.types import Inherited, Layers, NonNegative, Steps
+from vla.models.chunking import with_prefix
 from vla.models.layers import Batch, mean_where, transformer_decoder
 from vla.models.model import ContextModel, Prediction
 
-Denoise = Callable[[Tensor, Tensor], Tensor]  # noisy actions (B, k, D) and times (B,) → (B, k, D), with a context
+Denoise = Callable[[Tensor, Tensor], Tensor]  # noisy actions (B, k, D) and times → (B, k, D), with a context
 MAX_FREQUENCY, MIN_FREQUENCY = 100.0, 1.0  # of the time embedding [rad]; time runs from 0 to 1
 
 
@@ -48,18 +49,19 @@ class Denoiser(nn.Module):
         self.register_buffer("mask", torch.ones(chunk, chunk, dtype=torch.bool).triu(1), persistent=False)
 
     def forward(self, noisy: Tensor, time: Tensor, context: Tensor, padding: Tensor | None = None) -> Tensor:
-        """Map (B, k, D) noisy actions at (B,) times in 0 … 1 to (B, k, D).
+        """Map (B, k, D) noisy actions at (B,) or (B, k) times in 0 … 1 to (B, k, D).
 
         The (B, M, E) context has a (B, M) bool mask, true for padding; None: there is none.
         """
-        time_token = self.time(sinusoidal_embedding(time, self.width)).unsqueeze(1)  # (B, 1, E)
+        time_token = self.time(sinusoidal_embedding(time, self.width))
+        time_token = time_token if time.dim() > 1 else time_token.unsqueeze(1)  # (B, k or 1, E)
         tokens = self.action(noisy) + self.positions.weight + time_token
         hidden = self.transformer(tokens, context, self.mask, memory_key_padding_mask=padding, tgt_is_causal=True)
         return self.head(hidden)
 
 
 def sinusoidal_embedding(time: Tensor, width: int) -> Tensor:
-    """Embed (B,) times in 0 … 1 as (B, width) sines and cosines."""
+    """Embed times (…) in 0 … 1 as (…, width) sines and cosines."""
     exponents = torch.linspace(math.log(MIN_FREQUENCY), math.log(MAX_FREQUENCY), width // 2, device=time.device)
     angle = time.float().unsqueeze(-1) * exponents.exp()
     return torch.cat([angle.sin(), angle.cos()], -1)
@@ -133,12 +135,18 @@ class DenoisingModel(ContextModel):
         noise = torch.randn(action.shape, generator=generator).to(action)
         uniform = torch.rand(len(action), generator=generator).to(action)
         noisy, time, target = self.corrupt(action, noise, uniform)
+        counted = batch["valid"][:, -1].repeat(self.copies, 1)
+        if self.prefix:
+            executed = self.scaled(batch["executed"][:, -1]).repeat(self.copies, 1, 1)
+            length = torch.randint(self.prefix + 1, (len(action),), generator=generator).to(time.device)
+            noisy, time = with_prefix(noisy, time, executed, length)
+            counted = counted & (torch.arange(self.chunk, device=time.device) >= length.unsqueeze(1))
         error = (self.denoiser(noisy, time, context, padding).float() - target).square()
-        return {"action_loss": mean_where(error.mean(-1), batch["valid"][:, -1].repeat(self.copies, 1))}
+        return {"action_loss": mean_where(error.mean(-1), counted)}
 
     def predict(self, batch: Batch) -> Prediction:
         """Denoise the "noise" of the batch, or else a fixed noise."""
         encoded = self.encoded(batch)
         noise = batch["noise"] if "noise" in batch else self.noise.expand(len(encoded.tokens), -1, -1)
-        denoise = partial(self.denoiser, context=encoded.tokens, padding=encoded.padding)
+        denoise = self.continued(partial(self.denoiser, context=encoded.tokens, padding=encoded.padding), batch)
         return Prediction(self.unscaled(self.sample(self.temperature * noise, denoise)))

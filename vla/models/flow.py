@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from vla.io.errors import UserError
+from vla.io.types import Inherited, Natural
 from vla.models.denoiser import Denoise, DenoisingModel
 
 MAX_TIME = 0.999  # of training
@@ -21,7 +23,23 @@ class Flow(DenoisingModel):
 
     Training times follow π0, 0.999 (1 - Beta(1.5, 1)). Early times are more frequent: there the prediction depends on
     the context, later mostly on the noisy actions themselves.
+
+    Args:
+        prefix: largest number of actions at the start of a chunk that training gives, at time 1, as they were executed,
+            to predict the others; for `vla.models.chunking.TrainedPrefix`.
+
+    Raises:
+        UserError: `prefix` leaves fewer actions than are executed.
     """
+
+    continues = True
+
+    def __init__(self, prefix: Natural = 0, **inherited: Inherited) -> None:
+        super().__init__(**inherited)
+        self.prefix = prefix
+        if prefix + self.execute > self.chunk:
+            left = f"less than {self.execute} of the model.chunk={self.chunk} actions"
+            raise UserError(f"model.prefix={prefix} leaves {left}, which are executed: lower it, or raise model.chunk")
 
     def corrupt(self, action: Tensor, noise: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Interpolate between noise and actions; the target is the constant velocity of that path."""

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from vla.io.errors import UserError
 from vla.io.types import ImageSize, Inherited, NonNegative, Shift, Steps, Width
+from vla.models.chunking import Chunking, Running, Velocity
 from vla.models.context import Context, Encoded
 from vla.models.kinematics import RobotState
 from vla.models.layers import Batch, RunningNormalizer, mean_where, newest
@@ -38,8 +39,10 @@ class Model(nn.Module, ABC):
     A batch is a dict, which `transforms` has made of observations:
         rgb: camera → (B, T, H, W, 3) uint8 of `image_size`; state: (B, T, P) float32; present: (B, T) bool, false for
         padding; text: from `text.tokenize`. For training also action: (B, T, k, D) float32; valid: (B, T, k) bool, the
-        loss mask, true for a prefix of each chunk; unperturbed: (B, T) bool, false where a perturbation falls in the
-        chunk; truth: (B, T, S) float32. For generative models optionally noise: (B, k, D) float32, standard normal.
+        loss mask, true for a prefix of each chunk; executed: what the robot did, as action; unperturbed: (B, T) bool,
+        false where a perturbation falls in the chunk; truth: (B, T, S) float32. For generative models optionally noise:
+        (B, k, D) float32, standard normal; for plans that continue others running: (B, k, D) float32, remaining and
+        delay: (B,), see `chunking.Running`.
 
     A policy executes the first `execute` of the k actions before it predicts again.
 
@@ -62,6 +65,9 @@ class Model(nn.Module, ABC):
     """
 
     history = 1  # T, number of frames in the input
+    continues = False  # whether its plans can continue running ones, by a `chunking` that the policy sets
+    chunking: Chunking | None = None
+    prefix = 0  # longest start of a chunk that was given in training
     uses_tokens = True  # whether actions are predicted as tokens; else as numbers, scaled by the tokenizer's bounds
 
     def __init__(
@@ -116,6 +122,13 @@ class Model(nn.Module, ABC):
     def predict_truth(self, features: Tensor) -> dict[str, Tensor]:
         """Return truth: (B, T', S), normalised, given (B, T', width) features; nothing without an auxiliary head."""
         return {} if self.truth_head is None else {"truth": self.truth_head(features)}
+
+    def continued(self, velocity: Velocity, batch: Batch) -> Velocity:
+        """Return a velocity that continues the running plans of a batch, if it has any."""
+        if self.chunking is None or "running" not in batch:
+            return velocity
+        running = Running(self.scaled(batch["running"]), batch["remaining"], batch["delay"])
+        return self.chunking.continued(velocity, running)
 
     def scaled(self, action: Tensor) -> Tensor:
         """Scale (…, D) actions so that the bounds of the tokenizer become -1 and 1; nothing is clipped."""

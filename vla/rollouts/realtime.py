@@ -11,15 +11,15 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 
 from vla.io.types import NonNegative, Rate
 from vla.rollouts.rollout import AgentFactory, close_agent
-from vla.schedule import Schedule
-from vla.spec import Agent, Array, Environment, Observation, Spec
+from vla.schedule import Delays, Schedule
+from vla.spec import Agent, Array, Environment, Observation, Running, Spec
 
 Plan = Callable[[Observation], Array]  # returns a chunk (k, D)
 
@@ -97,7 +97,7 @@ class RealTime:
         self._take()
         execute = 1 if first or self._ensemble is not None else self._execute()
         if self._answer is None and self._schedule.wants_plan(self._step, execute):
-            self._answer, self._observed = self._link.send(observation, first), self._step
+            self._answer, self._observed = self._link.send(self._running(observation), first), self._step
             self._take(wait=first)
         if actions := self._schedule.at(self._step):
             self._step += 1  # only now: while the arm holds, no action becomes obsolete
@@ -105,6 +105,13 @@ class RealTime:
             return self._last
         assert self._last is not None, "the first answer has actions"
         return np.where(self._relative, 0, self._last).astype(np.float32)
+
+    def _running(self, observation: Observation) -> Observation:
+        """Return the observation with the rest of the plan that is executed until the next one is there."""
+        rest = self._schedule.remaining(self._step)
+        if not rest or self._ensemble is not None:
+            return observation
+        return replace(observation, running=Running(np.stack(rest), min(self._link.delays.longest, len(rest))))
 
     def _take(self, wait: bool = False) -> None:
         if self._answer is not None and (wait or self._answer.done()):
@@ -129,6 +136,8 @@ class SimulatedLink:
     def __init__(self, plan: Plan, network: Network, control_hz: float) -> None:
         """Put a policy behind a network; `control_hz` is the number of steps per second [Hz]."""
         self._plan, self._network, self._hz = plan, network, control_hz
+        self.delays = Delays(1 / control_hz)
+        self.delays.add(network.latency + network.jitter)
         self.reset(0)
 
     def reset(self, seed: int) -> None:
@@ -171,6 +180,7 @@ class BackgroundLink:
         """Start the thread of a policy that acts `control_hz` times per second [Hz]."""
         self._plan, self._period = plan, 1 / control_hz
         self._thread = ThreadPoolExecutor(1, "policy")
+        self.delays = Delays(self._period)
         self._next = 0.0  # when the next control step begins
 
     def reset(self, seed: int) -> None:
@@ -186,7 +196,13 @@ class BackgroundLink:
 
     def send(self, observation: Observation, first: bool) -> Future[Array]:
         """Let the thread plan."""
-        return self._thread.submit(self._plan, observation)
+        return self._thread.submit(self._timed, observation)
+
+    def _timed(self, observation: Observation) -> Array:
+        began = time.monotonic()
+        actions = self._plan(observation)
+        self.delays.add(time.monotonic() - began)
+        return actions
 
     def close(self) -> None:
         """End the thread once the policy is idle."""

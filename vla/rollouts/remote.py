@@ -126,6 +126,8 @@ class RemotePolicy:
             for name in ("execute", "history")
         )
         self.history = history or 1  # frames of a window; above 1 every observation is sent
+        # Plans come back as they were sent, which a mapping of actions cannot do.
+        self.chunking = self.metadata.get("chunking") is True and self.actions is None
         self._wanted = self._configured_execute or (1 if self.history > 1 else advertised)
 
     def reset(self, instruction: str, seed: int) -> None:
@@ -176,6 +178,8 @@ class RemotePolicy:
             for key, names in self.state.items()
         }
         sent[self.prompt] = observation.instruction
+        if observation.running is not None and self.chunking:
+            sent["running"] = {"actions": observation.running.actions, "delay": observation.running.delay}
         for camera, key in self._images.items():
             image = _resized(observation.rgb[camera], self.image_size)
             *outer, name = [key] if isinstance(key, str) else key

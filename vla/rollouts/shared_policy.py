@@ -24,7 +24,7 @@ import numpy as np
 
 from vla.io.errors import UserError
 from vla.parallel.processes import one_thread_each
-from vla.spec import Agents, Array, Environment, Observation, Spec
+from vla.spec import Agents, Array, Environment, Observation, Running, Spec
 
 MOST = 1024  # workers
 
@@ -117,11 +117,12 @@ def _talk(policy: Planner, requests: queue.Queue[Request | None], lane: int, con
         memory.unlink()
 
 
-def _observation(memory: SharedMemory, spec: Spec, instruction: str, images: bool) -> Observation:
-    """Return a copy of what a worker sees, without `images` if it gave none."""
+def _observation(memory: SharedMemory, spec: Spec, instruction: str, given: tuple[bool, Running | None]) -> Observation:
+    """Return a copy of what a worker sees: whether it gave images, and its running plan."""
+    images, running = given
     seen = {name: view.copy() for name, view in _views(memory, spec).items()}
     state = seen.pop("")
-    return Observation(seen if images else {}, state, instruction)
+    return Observation(seen if images else {}, state, instruction, running=running)
 
 
 def _sizes(spec: Spec) -> list[int]:
@@ -176,7 +177,8 @@ class DistantPolicy:
                 wanted, found = (f"{each.shape} {each.dtype}" for each in (place, array))
                 raise UserError(f"the policy needs {name or 'a state'} of {wanted}, not {found}")
             place[:] = array
-        return self._ask(kind, observation.instruction, all(camera in given for camera in self.spec.cameras))
+        images = all(camera in given for camera in self.spec.cameras)
+        return self._ask(kind, observation.instruction, (images, observation.running))
 
     def _ask(self, kind: str, instruction: str, given: object) -> Any:
         self._connection.send((kind, instruction, given))

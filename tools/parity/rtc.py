@@ -1,0 +1,63 @@
+"""What LeRobot's real-time chunking computes, to compare with: `python rtc.py ../../tests/rtc_reference.npz`.
+
+Runs in an environment with torch and numpy, and with LeRobot (0.4.4) in PYTHONPATH, whose dependencies are not needed:
+`pip install --no-deps --target SITE lerobot==0.4.4`. Writes the inputs, and for every case the guided velocity.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import torch
+from torch import Tensor
+
+SEED, BATCH, CHUNK, COMPONENTS = 0, 2, 8, 3
+# Actions that are over when the plan arrives, actions that remain, time from 1 for noise to 0 for actions, β.
+CASES = [
+    (delay, rest, time, limit)
+    for delay, rest in ((0, 5), (2, 6), (3, 3), (3, 8))
+    for time, limit in ((1.0, 10.0), (0.7, 10.0), (0.1, 5.0))
+]
+
+
+def without_imports() -> None:
+    """Let LeRobot's packages be imported without what their `__init__` imports."""
+    found = find_spec("lerobot")
+    assert found and found.submodule_search_locations, "LeRobot is not in PYTHONPATH"
+    root = Path(found.submodule_search_locations[0])
+    for name in ("", ".configs", ".policies", ".policies.rtc"):
+        module = ModuleType(f"lerobot{name}")
+        module.__path__ = [str(root.joinpath(*name.split(".")))]
+        sys.modules[module.__name__] = module
+
+
+def main(path: str) -> None:
+    """Write the inputs and LeRobot's results."""
+    without_imports()
+    from lerobot.configs.types import RTCAttentionSchedule
+    from lerobot.policies.rtc.configuration_rtc import RTCConfig
+    from lerobot.policies.rtc.modeling_rtc import RTCProcessor
+
+    random = torch.Generator().manual_seed(SEED)
+    matrix = torch.randn(COMPONENTS, COMPONENTS, generator=random)
+    noisy, previous = (torch.randn(BATCH, CHUNK, COMPONENTS, generator=random) for _ in range(2))
+    results = {"linear": list[Tensor](), "exponential": list[Tensor]()}
+    for decay, schedule in (("linear", RTCAttentionSchedule.LINEAR), ("exponential", RTCAttentionSchedule.EXP)):
+        for delay, rest, time, limit in CASES:
+            config = RTCConfig(True, schedule, max_guidance_weight=limit, execution_horizon=CHUNK)
+            left, at = previous[:, :rest], torch.tensor(time)
+            velocity = RTCProcessor(config).denoise_step(
+                noisy, left, delay, at, lambda actions, at=at: (actions @ matrix + at).tanh()
+            )
+            results[decay].append(velocity)
+    arrays = {"matrix": matrix, "noisy": noisy, "previous": previous, "cases": torch.tensor(CASES)}
+    arrays |= {decay: torch.stack(found) for decay, found in results.items()}
+    np.savez_compressed(path, allow_pickle=False, **{name: values.numpy() for name, values in arrays.items()})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

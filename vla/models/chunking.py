@@ -1,0 +1,112 @@
+"""Real-time chunking: the plan of a flow model goes on from the one that is executed while it is computed.
+
+Guidance is that of K. Black, M. Galliker, S. Levine, arXiv 2506.07339; training with what is certain, arXiv 2512.05964.
+
+Shapes: B batch, k action chunk, D action components.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from vla.io.errors import UserError
+from vla.io.types import Positive
+
+# Noisy actions (B, k, D) and their times, (B,) or (B, k), from 0 for noise to 1 for actions → velocity (B, k, D).
+Velocity = Callable[[Tensor, Tensor], Tensor]
+
+
+class Running(NamedTuple):
+    """The plans that are executed, from the times of the observations on."""
+
+    actions: Tensor  # (B, k, D) as the model scales them, of which the first `remaining` count
+    remaining: Tensor  # (B,) 0: there is no plan
+    delay: Tensor  # (B,) actions, at most `remaining`, that will be over when the next plan arrives
+
+
+class Chunking(ABC):
+    """How the velocity of a plan's actions is changed so that the plan continues a running one."""
+
+    @abstractmethod
+    def continued(self, velocity: Velocity, running: Running) -> Velocity:
+        """Return the changed velocity; where no plan runs it is the old one."""
+
+
+class Guided(Chunking):
+    """Guidance towards the running plan, for policies that were not trained for it.
+
+    At time t, with v the velocity, the estimated actions are A = a + (1 - t) v, and the velocity becomes
+    v + min(limit, (t² + (1 - t)²) / (t (1 - t))) (∂A/∂a)ᵀ W (running - A). W is 1 for actions that are over when the
+    plan arrives, and then decays to 0 where the running plan ends.
+
+    Args:
+        jacobian: with ∂A/∂a as published, by a pass back through the network, or the identity, as in LeRobot.
+        decay: of W: linear, c, or c (exp(c) - 1) / (e - 1).
+        limit: largest factor of the guidance, β.
+    """
+
+    def __init__(self, jacobian: bool, decay: Literal["exponential", "linear"], limit: Positive) -> None:
+        self._jacobian, self._decay, self._limit = jacobian, decay, limit
+
+    def continued(self, velocity: Velocity, running: Running) -> Velocity:
+        """Return the guided velocity."""
+        place = torch.arange(running.actions.shape[1], device=running.actions.device)
+        start, end = running.delay.unsqueeze(1), running.remaining.unsqueeze(1)
+        falling = (1 - (place - start + 1) / (end - start + 1)).clamp(0, 1).unsqueeze(-1)  # (B, k, 1)
+        weights = falling if self._decay == "linear" else falling * falling.expm1() / (math.e - 1)
+
+        def guided(noisy: Tensor, time: Tensor) -> Tensor:
+            t = time[:, None, None]
+            made = torch.func.vjp(lambda noisy: velocity(noisy, time), noisy) if self._jacobian else None
+            free = made[0] if made else velocity(noisy, time)
+            error = weights * (running.actions - (noisy + (1 - t) * free))
+            correction = error + (1 - t) * made[1](error)[0] if made else error  # ∂A/∂a is 1 + (1 - t) ∂v/∂a
+            factor = ((t**2 + (1 - t) ** 2) / (t * (1 - t))).clamp(max=self._limit)
+            return free + factor * correction
+
+        return guided
+
+
+class TrainedPrefix(Chunking):
+    """The network is given the actions that are over when the plan arrives, as in training."""
+
+    def continued(self, velocity: Velocity, running: Running) -> Velocity:
+        """Return the velocity given the prefix."""
+        return lambda noisy, time: velocity(*with_prefix(noisy, time, running.actions, running.delay))
+
+
+def with_prefix(noisy: Tensor, time: Tensor, clean: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+    """Replace the first (B,) `length` of (B, k, D) noisy actions by clean ones, and return them with (B, k) times."""
+    known = torch.arange(noisy.shape[1], device=noisy.device) < length.unsqueeze(1)
+    return torch.where(known.unsqueeze(-1), clean, noisy), time.unsqueeze(1).masked_fill(known, 1.0)
+
+
+def require_chunking(method: type, model: type, prefix: int) -> None:
+    """Raise a UserError unless models of a class, trained with prefixes up to a length, can continue plans."""
+    if not getattr(model, "continues", False):
+        why = f"continues the plans of flow models, and {model.__name__} is none: omit it, or choose model=flow"
+    elif issubclass(method, TrainedPrefix) and not prefix:
+        why = "needs a model that was trained with prefixes: model.prefix=4; else choose +policy/chunking=guided"
+    else:
+        return
+    raise UserError(f"policy.chunking={method.__name__} {why}")
+
+
+def require_fit(method: type, model: Mapping[str, Any], delay: int) -> None:
+    """Raise a UserError if plans of the node of a model cannot be late by a delay [actions]."""
+    chunk = model["chunk"]
+    after = max(delay, model["execute"] or chunk)
+    if delay + after > chunk:
+        raise UserError(
+            f"a plan that is late by {delay} actions ends before the next one, which follows {after} actions after it, "
+            f"as model.chunk={chunk}: train with a larger one, or lower the delay or model.execute"
+        )
+    if issubclass(method, TrainedPrefix) and delay > model["prefix"]:
+        trained = f"model.prefix={model['prefix']}"
+        raise UserError(f"a plan is late by {delay} actions, more than the {trained} that it was trained for")
