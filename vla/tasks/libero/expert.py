@@ -17,7 +17,6 @@ from vla.tasks.libero.places import in_the_way, place_of
 from vla.tasks.libero.situation import HELD, THIN, Situation
 from vla.tasks.libero.skills import approach, carry, command, drag, pull, push, twist, withdraw
 
-ORDER = ("open", "turnon", "on", "in", "close", "turnoff")  # in which parts of a goal are done
 DRAWERS = ("wooden_cabinet", "white_cabinet")  # what must be open for something to be put in
 NARROW = 0.006  # room about the hand below which a thing under something else is first dragged out [m]
 
@@ -61,12 +60,11 @@ class Planner:
 
 def decide(at: Situation) -> Array:
     """Return the command (7,) for a state."""
-    parts = sorted(at.task.goal, key=lambda part: ORDER.index(part[0]))
-    todo = [part for part in parts if not at.goal.holds(at.data, *part)]
+    todo = at.goal.todo(at.data)
     touched = at.touched()
     held = touched if at.opening < HELD and at.gap > THIN else None
     if not todo or (touched is not None and all(at.subject(part[1]) != touched for part in todo)):
-        done = next((part for part in parts if part[1] == held and part[0] == "in"), None)
+        done = next((part for part in at.goal.parts if part[1] == held and part[0] == "in"), None)
         if done is not None and todo and at.subject(done[2]).startswith(DRAWERS):
             return _deliver(at, done[1], done[2], True)  # it counts as there, but it is not down yet
         return command(at, at.hand, at.yaw, -1.0, at.lean)
