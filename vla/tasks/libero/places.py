@@ -23,6 +23,7 @@ THICK = 0.03  # largest height of what carries things over the middle of a flat 
 GRID = np.stack(np.meshgrid(*[np.linspace(-0.8, 0.8, 5)] * 2), axis=-1).reshape(-1, 2)
 WAYS = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(16) * np.pi / 8])  # out from under a roof
 OBLIQUE = np.where(np.arange(len(WAYS)) % 4, 0.1, 0.0)  # costs of ways that are not along a wall [m]
+ROUND = 0.7  # least ratio of the variances along both sides of a thing that is not turned to be put down
 ROOFED = 0.05  # cost of a place wholly under a roof
 
 
@@ -124,7 +125,9 @@ def _floor(at: Situation, where: str, middle: Array, extent: Array) -> float:
 
 def _turns(points: Array) -> tuple[float, ...]:
     """Return turns [rad] worth trying: none, and those that lay a thing's long side along an axis of the world."""
-    _, directions = np.linalg.eigh(np.cov(points[:, :2].T))
+    variances, directions = np.linalg.eigh(np.cov(points[:, :2].T))
+    if variances[0] > ROUND * variances[1]:
+        return (0.0,)
     angle = float(np.arctan2(directions[1, 1], directions[0, 1]))
     turns = [(quarter - angle + np.pi / 2) % np.pi - np.pi / 2 for quarter in (0, np.pi / 2)]
     return (0.0, *sorted(turns, key=abs))
