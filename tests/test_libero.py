@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,6 +15,8 @@ from replaying import played, same
 
 from vla.config.experiment import Experiment
 from vla.io.errors import UserError
+from vla.rollouts.rollout import rollout
+from vla.rollouts.supervised import Supervised
 from vla.spec import FIRST_SEED, Array, Observation
 from vla.tasks.libero import package, scene
 from vla.tasks.libero.controller import Controller
@@ -68,12 +71,13 @@ def test_every_predicate_is_judged_as_by_libero() -> None:
     seen = set()
     for name, positions in reference("positions").items():
         (model, data, goal), holds = opened(name), []
+        parts = tasks_of(name.split()[0])[int(name.split()[1])].goal
         for one in positions:
             data.qpos[:], data.qvel[:] = one, 0
             mujoco.mj_forward(model, data)
-            holds.append([goal.holds(data, *part) for part in goal.parts])
+            holds.append([goal.holds(data, *part) for part in parts])
         assert (np.array(holds) == reference("holds")[name]).all(), name
-        seen |= {(part[0], value) for row in holds for part, value in zip(goal.parts, row, strict=True)}
+        seen |= {(part[0], value) for row in holds for part, value in zip(parts, row, strict=True)}
     assert seen == {(kind, value) for kind in ("on", "in", "open", "close", "turnon") for value in (True, False)}
 
 
@@ -148,6 +152,43 @@ def _solved(environment: Libero, seed: int) -> Observation:
     assert environment.outcome == "success"
     assert np.array_equal(expert.act(seen), other.act(seen))  # which saw nothing of what was before
     return seen
+
+
+def test_the_planner_goes_on_from_where_another_agent_led() -> None:
+    class Restless:
+        """Moves aside and opens or closes the gripper, whatever it sees."""
+
+        memoryless, looks = True, False
+
+        def __init__(self) -> None:
+            self.info: dict[str, Any] = {}
+
+        def reset(self, instruction: str, seed: int) -> None:
+            self._random = np.random.default_rng(seed)
+
+        def act(self, observation: Observation) -> Array:
+            return self._random.uniform(-1, 1, 7).astype(np.float32) * (0.05, 0.05, 0.02, 0, 0, 0.2, 1)
+
+    with closing(world("task.suite=object", "task.tasks=[1]")) as environment, environment.blind():
+        planner = Planner(spec=environment.spec)
+        episode = rollout(environment, Supervised(Restless(), planner, beta=0.7, segment=6), 2, all_images=False)
+        assert episode.success
+        led = (episode.executed != episode.actions).any(axis=1)
+        assert 0.1 < led.mean() < 0.5
+        fresh = Planner(spec=environment.spec)
+        for number in np.flatnonzero(led)[::10]:
+            np.testing.assert_array_equal(fresh.act(episode.observations[number]), episode.actions[number])
+
+
+def test_the_truth_is_of_what_is_next() -> None:
+    with closing(world("task.suite=long", "task.tasks=[3]")) as environment, environment.blind():
+        expert = Planner(spec=environment.spec)
+        seen = environment.reset(1)
+        bowl = environment._scene.position("akita_black_bowl_1")
+        assert np.array_equal(seen.truth["object"], bowl)
+        while not np.array_equal(seen.truth["object"], seen.truth["goal"]):  # the drawer, once the bowl is in it
+            seen = environment.step(expert.act(seen))
+        assert environment._goal.todo(environment._scene.data)[0][0] == "close"
 
 
 @pytest.mark.parametrize(

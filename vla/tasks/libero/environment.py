@@ -157,11 +157,11 @@ class Libero(World):
     def _look(self) -> Observation:
         scene = self._scene
         pictures = () if self._blind else scene.pictures(self._mirror)
-        _, subject, *_ = self._task.goal[0]
+        part = (*self._goal.todo(scene.data), *self._goal.parts)[0]  # what is to be done next
         truth = {
-            "object": scene.position(subject),
-            "goal": scene.position(self._task.goal[0][-1]),
-            "commanded_position": scene.data.site_xpos[scene.controller.site].copy(),
+            "object": scene.position(part[1]),
+            "goal": scene.position(part[-1]),
+            "reach": self.tool - scene.base,  # the surface that things stand on is at the height of the base
             "task": np.array([ALL.index(self._task.suite), self._task.number]),
             "positions": scene.data.qpos.copy(),
             "fixtures": scene.fixtures(self._task),
@@ -202,6 +202,7 @@ class Scene:
         self._factory = renderer
         self._renderer: Renderer | None = None
         self.changed = True
+        self.base = model.body("robot0_base").pos.copy()  # of the arm (3,) [m]
         self._hand = model.body("robot0_right_hand").id
         first = model.joint("gripper0_finger_joint1").qposadr[0]
         self._fingers = slice(first, first + 2)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from vla.io.errors import UserError
 from vla.spec import Array, Observation, Spec
 from vla.tasks.libero.environment import STATE, action_of
@@ -17,8 +19,9 @@ from vla.tasks.libero.places import in_the_way, place_of
 from vla.tasks.libero.situation import HELD, THIN, Situation
 from vla.tasks.libero.skills import approach, carry, command, drag, pull, push, twist, withdraw
 
-ORDER = ("open", "turnon", "on", "in", "close", "turnoff")  # in which parts of a goal are done
 DRAWERS = ("wooden_cabinet", "white_cabinet")  # what must be open for something to be put in
+HOLLOWS = (*DRAWERS, "microwave")  # into which things are brought all the way
+ARRIVED = 0.015  # distance at which they are [m]
 NARROW = 0.006  # room about the hand below which a thing under something else is first dragged out [m]
 
 
@@ -61,14 +64,15 @@ class Planner:
 
 def decide(at: Situation) -> Array:
     """Return the command (7,) for a state."""
-    parts = sorted(at.task.goal, key=lambda part: ORDER.index(part[0]))
-    todo = [part for part in parts if not at.goal.holds(at.data, *part)]
+    todo = at.goal.todo(at.data)
     touched = at.touched()
     held = touched if at.opening < HELD and at.gap > THIN else None
     if not todo or (touched is not None and all(at.subject(part[1]) != touched for part in todo)):
-        done = next((part for part in parts if part[1] == held and part[0] == "in"), None)
-        if done is not None and todo and at.subject(done[2]).startswith(DRAWERS):
-            return _deliver(at, done[1], done[2], True)  # it counts as there, but it is not down yet
+        done = next((part for part in at.goal.parts if part[1] == held and part[0] == "in"), None)
+        if done is not None and todo and at.subject(done[2]).startswith(HOLLOWS):
+            place = place_of(at, done[1], done[2], True)
+            if np.linalg.norm(place.spot - at.origin(done[1])) > ARRIVED:
+                return carry(at, done[1], place)  # it counts as there, but it is not down or not far enough in yet
         return command(at, at.hand, at.yaw, -1.0, at.lean)
     part = next((part for part in todo if held is not None and part[1] == held), todo[0])
     if part[0] in ("on", "in") and _shut(at, part[2]):

@@ -17,6 +17,7 @@ STOVE_OFF = 0.005
 NEAR = 0.03  # largest distance from the middle of a thing to lie on [m]
 OVER = (-0.005, 0.10)  # height over the upper side of a region to lie on [m]
 SLACK = 0.01  # depth under the box of a region to lie in [m]
+ORDER = ("open", "turnon", "on", "in", "close", "turnoff")  # in which parts of a goal can be done
 
 
 class Goal:
@@ -24,7 +25,8 @@ class Goal:
 
     def __init__(self, model: mujoco.MjModel, goal: Sequence[Sequence[str]]) -> None:
         """Args: the model of a scene; predicates with their arguments, as in `Task.goal`."""
-        self._model, self.parts = model, [tuple(part) for part in goal]
+        self._model = model
+        self.parts = sorted((tuple(part) for part in goal), key=lambda part: ORDER.index(part[0]))
         names = [model.body(number).name for number in range(model.nbody)]
         self.bodies = {name.removesuffix("_main"): n for n, name in enumerate(names) if name.endswith("_main")}
         self.sites = {model.site(number).name: number for number in range(model.nsite)}
@@ -36,6 +38,10 @@ class Goal:
     def reached(self, data: mujoco.MjData) -> bool:
         """Return whether all predicates hold."""
         return all(self.holds(data, *part) for part in self.parts)
+
+    def todo(self, data: mujoco.MjData) -> list[tuple[str, ...]]:
+        """Return the predicates that do not hold, in an order in which they can be fulfilled."""
+        return [part for part in self.parts if not self.holds(data, *part)]
 
     def holds(self, data: mujoco.MjData, predicate: str, thing: str, place: str = "") -> bool:
         """Return whether one predicate holds."""

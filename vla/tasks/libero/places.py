@@ -17,12 +17,13 @@ ASIDE = 0.012  # between a thing and a drawer that is to be opened [m]
 SLIT = 0.008  # between a thing and what it passes [m]
 PUSHED = 0.06  # by which other things may be pushed by one that is dragged [m]
 SQUARE = 0.01  # edge of the squares in which one point stands for all that are over each other [m]
-STAY = 0.1  # cost per metre of a place from where the thing is carried: the choice stays the same
+STAY, REACHED = 0.5, 0.05  # cost per metre of a place from where the thing is, up to a distance: the choice then stays
 FLOOR = 0.012  # height over the floor of a region of what is in the way there [m]
 THICK = 0.03  # largest height of what carries things over the middle of a flat region [m]
 GRID = np.stack(np.meshgrid(*[np.linspace(-0.8, 0.8, 5)] * 2), axis=-1).reshape(-1, 2)
 WAYS = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(16) * np.pi / 8])  # out from under a roof
 OBLIQUE = np.where(np.arange(len(WAYS)) % 4, 0.1, 0.0)  # costs of ways that are not along a wall [m]
+ROUND = 0.7  # least ratio of the variances along both sides of a thing that is not turned to be put down
 ROOFED = 0.05  # cost of a place wholly under a roof
 
 
@@ -95,11 +96,13 @@ def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
         gaps, roofs = form.room(spots, rest)
         costs = away + 2 * np.maximum(0, MARGIN - gaps) + ROOFED * roofs
         if held:
-            costs += STAY * np.linalg.norm(spots[:, :2] - origin[:2], axis=1)
+            costs += STAY * np.minimum(np.linalg.norm(spots[:, :2] - origin[:2], axis=1), REACHED)
             hands = spots + turned(turn) @ (at.hand - origin)
-            costs += np.maximum(0, CLEAR - clearance(hands, np.full(len(hands), at.yaw + turn), rest)) + far(at, hands)
+            costs += _hindrance(hands, at.yaw + turn, rest) + far(at, hands)
         one = int(np.argmin(costs))
         out = form.out(spots[one], rest, OBLIQUE) if roofs[one] else None
+        if held and out is not None:  # the hand must also have room where it comes down
+            one = int(np.argmin(costs + _hindrance(hands + out, at.yaw + turn, rest)))
         slack = float(np.clip(gaps[one], TIGHT, LOOSE)) if out is None else SLIT
         options.append((float(gaps[one]), Place(spots[one], turn, slack, out)))
         if gaps[one] > 0:
@@ -108,6 +111,11 @@ def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
     if best[0] > options[0][0] + MARGIN or extent[2] < THICK:
         return best[1]
     return replace(options[0][1], slack=LOOSE)  # it fits nowhere, so it lies on what is there
+
+
+def _hindrance(hands: Array, yaw: float, rest: Array) -> Array:
+    """Return costs (K,) of what is close to the hand at places (K, 3) [m]."""
+    return np.maximum(0, CLEAR - clearance(hands, np.full(len(hands), yaw), rest))
 
 
 def _floor(at: Situation, where: str, middle: Array, extent: Array) -> float:
@@ -124,7 +132,9 @@ def _floor(at: Situation, where: str, middle: Array, extent: Array) -> float:
 
 def _turns(points: Array) -> tuple[float, ...]:
     """Return turns [rad] worth trying: none, and those that lay a thing's long side along an axis of the world."""
-    _, directions = np.linalg.eigh(np.cov(points[:, :2].T))
+    variances, directions = np.linalg.eigh(np.cov(points[:, :2].T))
+    if variances[0] > ROUND * variances[1]:
+        return (0.0,)
     angle = float(np.arctan2(directions[1, 1], directions[0, 1]))
     turns = [(quarter - angle + np.pi / 2) % np.pi - np.pi / 2 for quarter in (0, np.pi / 2)]
     return (0.0, *sorted(turns, key=abs))

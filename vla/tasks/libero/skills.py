@@ -64,12 +64,13 @@ def carry(at: Situation, thing: str, place: Place) -> Array:
             return command(at, at.hand + place.spot - origin, yaw, 1.0, lean)
     offset = place.spot - origin
     away = float(np.hypot(*offset[:2]))
-    down = offset[2] > -0.012 or (offset[2] > -RESTS and place.slack == LOOSE and at.rests(thing))
-    if away < min(0.015, place.slack) and down and abs(place.turn) < TURNED:
+    lies = offset[2] > -RESTS and place.slack == LOOSE and at.rests(thing)
+    close = away < (0.03 if lies else min(0.015, place.slack))
+    if close and (lies or offset[2] > -0.012) and abs(place.turn) < TURNED:
         return command(at, at.hand, yaw, -1.0, lean)
     away += 0.1 * abs(place.turn)
     lift = min(FUNNEL * away, CARRY) if away > 0.6 * place.slack else 0.0
-    if away > place.slack:
+    if away > max(place.slack, 0.015):
         lift += max(0.0, _above(at, thing, place.spot))
     return command(at, rising(at, at.hand + offset + lift * UP), yaw, 1.0, lean)
 
@@ -165,7 +166,7 @@ def push(at: Situation, thing: str) -> Array:
         ahead = ahead / np.linalg.norm(ahead)
     depth = points @ ahead
     face = points[depth < depth.min() + 0.012]
-    contact = np.array([*face[:, :2].mean(axis=0), max(face[:, 2].max() - 0.02, face[:, 2].mean())])
+    contact = np.array([*face[:, :2].mean(axis=0), max(face[:, 2].max() - 0.035, face[:, 2].mean())])
     offset = at.hand - contact
     before = float(offset @ ahead)
     aside = float(np.linalg.norm((offset - before * ahead)[:2]))
