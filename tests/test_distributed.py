@@ -14,7 +14,8 @@ from command_line import SMALL, vla
 from defaults import defaults_of
 from reading import windows
 from resuming import STOP, same
-from together import PAIRS, composed, train, untrained
+from together import PAIRS, TRUNK, composed, train, train_trunk, untrained
+from trunk import make_trunk_model
 
 from vla.config.experiment import make_policy
 from vla.models.learner import Learner
@@ -54,6 +55,20 @@ def test_two_processes_learn_what_one_learns_from_batches_twice_as_large(
     found = train(folder, tmp_path, "trainer=cpu", model, "data.batch_size=16")
     assert torch.load(together / pair / "found.pt", weights_only=True) == pytest.approx(found, rel=1e-3)
     require_equal(tmp_path / LAST, together / pair / LAST, untrained(folder, model))
+
+
+def test_two_processes_learn_what_one_learns_in_a_trunk_whose_layers_they_share(
+    folder: Path, together: Path, tmp_path: Path
+) -> None:
+    found = train_trunk(folder, tmp_path, 16)
+    assert torch.load(together / TRUNK / "found.pt", weights_only=True) == pytest.approx(found, rel=1e-3)
+    ends = [torch.load(path / LAST, weights_only=True)["current_model_state"] for path in (tmp_path, together / TRUNK)]
+    assert ends[0].keys() == ends[1].keys()
+    start = {f"model.{name}": value for name, value in make_trunk_model().state_dict().items()}
+    for name, value in ends[0].items():
+        torch.testing.assert_close(ends[1][name], value, rtol=1e-3, atol=1e-4, msg=name)
+        if ".trunk." in name and ".lora_" not in name:
+            assert torch.equal(value, start[name.replace(".base_layer", "")])
 
 
 @pytest.mark.parametrize("pair", PAIRS)

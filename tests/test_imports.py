@@ -51,6 +51,7 @@ LIBRARIES = {
     "rerun": ("vla.rollouts.recorder",),
     "rclpy": ("vla.deploy",),
     "timm": ("vla.models.vision.timm_encoders",),
+    "peft": ("vla.models.lora",),
     "transformers": ("vla.models.text.huggingface", "vla.models.vlm"),
 }
 HEAVY = ("torch", "lightning", "mujoco", "dm_control", "rerun", "matplotlib")

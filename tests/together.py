@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import composing
 import lightning
@@ -14,16 +15,22 @@ import numpy as np
 import reading
 import resuming
 import torch
+import toy
+from defaults import defaults_of
 from fake_batch import make_rt1
+from small_training import CONFIG
+from trunk import make_trunk_model
 
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.models.learner import Learner
+from vla.models.lora import LoRA
 from vla.models.policy_folder import POLICY
 from vla.runs.folder import LAST
 from vla.training.trainer import make_trainer, quiet_lightning
 
 PAIRS = ("ddp,rt1_tiny", "fsdp,decoder")  # trainer, model
+TRUNK = "fsdp,trunk"
 SMALL = (
     "collect.episodes=30",
     "data.validation_fraction=0.2",
@@ -75,6 +82,30 @@ def train_pairs(store: Path, folder: Path) -> None:
         torch.save(found, folder / pair / "found.pt")
 
 
+def train_trunk(store: Path, folder: Path, batch_size: int, **trainer: Any) -> dict[str, float]:
+    """Train factors of LoRA in a network of transformers, whose layers compute activations again, and all around it."""
+    model = make_trunk_model()
+    quiet_lightning()
+    lora = LoRA(**defaults_of("learner/lora/low_rank", modules=("q_proj", "v_proj"), rank=4))
+    options = defaults_of("learner/default", lr=1e-3, warmup_steps=0, schedule="constant", frozen=["context.trunk"])
+    learner = Learner(**options | {"lora": lora, "checkpointing": True}, model=model, spec=toy.SPEC, config=CONFIG)
+    made = make_trainer(resuming.config(max_steps=4, val_check_interval=2, **trainer), folder)
+    data = reading.windows(
+        store, history=1, chunk=model.chunk, tokenize=model.text.tokenize, batch_size=batch_size, validation_windows=16
+    )
+    made.fit(learner, datamodule=data)
+    for name in (LAST, POLICY):
+        made.save_checkpoint(folder / name, weights_only=False)
+    return {name: value.item() for name, value in made.callback_metrics.items() if name.startswith("val/")}
+
+
+def train_trunks(store: Path, folder: Path) -> None:
+    """Leave what two processes find that share the weights of every layer of a trunk."""
+    strategy = {"_target_": "lightning.pytorch.strategies.ModelParallelStrategy", "save_distributed_checkpoint": False}
+    found = train_trunk(store, folder / TRUNK, 8, devices=2, strategy=strategy)
+    torch.save(found, folder / TRUNK / "found.pt")
+
+
 def train_in_pieces(store: Path, folder: Path) -> None:
     """Save the checkpoints of an uninterrupted training, of its first half, and of the resumed second half."""
     model = make_rt1(dropout=0.2)
@@ -95,5 +126,5 @@ def see_windows(store: Path, folder: Path) -> None:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     store, folder = Path(sys.argv[1]), Path(sys.argv[2])
-    for leave in (train_pairs, train_in_pieces, see_windows):
+    for leave in (train_pairs, train_trunks, train_in_pieces, see_windows):
         leave(store, folder)

@@ -221,6 +221,7 @@ class Experiment:
         """
         from vla.models.checkpoint import read_content, weights_of
         from vla.models.policy_folder import read_policy
+        from vla.models.trunk import Source
 
         saved, content = read_policy(origin) if origin else None, read_content(last) if last else None
         if saved:
@@ -230,10 +231,13 @@ class Experiment:
         model = _model(self.nodes, spec, saved, weights=bool(origin or last))
         if saved:
             saved.initialize(model)
+        for name, source in content.get("trunks", {}).items() if content else ():
+            model.get_submodule(name).source = Source(**source)  # type: ignore[assignment]
+        learner: Learner = self.build("learner", model=model, spec=spec, config=self.config)
         if content:
             # Before Lightning does, because a sharded model cannot load what modules keep besides their weights.
-            model.load_state_dict(weights_of(content))
-        return self.build("learner", model=model, spec=spec, config=self.config)
+            learner.model.load_state_dict(weights_of(content))
+        return learner
 
     def fit_tokenizer(self, tokenizer: ActionTokenizer, store: EpisodeStore) -> None:
         """Fit a tokenizer to a store's actions."""
@@ -320,7 +324,7 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
     if environment is not None:
         saved.spec.require_input(environment.spec, f"the policy {checkpoint}", "the task")
     if not own:
-        require_no_paths({**saved.config, "model": _without_weights(saved.config["model"])}, PARTS, checkpoint)
+        require_no_paths({**saved.config, "model": _model_node(saved.config, saved, weights=True)}, PARTS, checkpoint)
     model = _model(saved.config, saved.spec, saved, weights=True)
     saved.restore(model)
     try:
@@ -351,10 +355,16 @@ def _model(nodes: Node, spec: Spec, saved: SavedPolicy | None = None, weights: b
 
     A model that is larger than the weights of the `saved` policy is refused.
     """
-    node, tokenizer = nodes["model"], build(nodes["tokenizer"], "tokenizer", spec=spec)
+    tokenizer = build(nodes["tokenizer"], "tokenizer", spec=spec)
     with saved.budget() if saved else nullcontext():
-        model: Model = build(_without_weights(node) if weights else node, "model", spec=spec, tokenizer=tokenizer)
+        model: Model = build(_model_node(nodes, saved, weights), "model", spec=spec, tokenizer=tokenizer)
     return model
+
+
+def _model_node(nodes: Node, saved: SavedPolicy | None, weights: bool) -> Node:
+    """Return the node of a model that gets `weights`: without pretrained ones, unless a `saved` policy lacks those."""
+    named = saved is not None and bool(saved.training.trunks)
+    return _without_weights(nodes["model"]) if weights and not named else nodes["model"]
 
 
 def _without_weights(model: Node) -> Node:

@@ -129,7 +129,7 @@ class WindowDataModule(LightningDataModule):
         self.batch_size = batch_size
         self._folder, self._spec, self._episodes, self._more = Path(folder), spec, episodes, more
         self._history, self._chunk, self._depth = history, chunk, depth
-        self._seed, self._ahead, self._tokenize = seed, ahead, tokenize
+        self._seed, self.ahead, self._tokenize = seed, ahead, tokenize
         self._fraction, self._validation_windows = validation_fraction, validation_windows
 
     def setup(self, stage: str | None = None) -> None:
@@ -170,7 +170,7 @@ class WindowDataModule(LightningDataModule):
 
     def train_dataloader(self) -> Prefetcher:
         """Return endless batches, from the trainer's current step on."""
-        return Prefetcher(self._make_batch, self._training_plan, self._ahead)
+        return Prefetcher(self._make_batch, self._training_plan, self.ahead)
 
     def val_dataloader(self) -> SizedPrefetcher | list[Batch]:
         """Return the validation batches, the same every time."""
@@ -182,7 +182,7 @@ class WindowDataModule(LightningDataModule):
         # Whole batches: one shape for a compiled model, and the same number of steps in all processes.
         spread = np.linspace(0, len(self.held_out_windows) - 1, batches * share).round().astype(np.int64)
         windows = self.held_out_windows[spread].reshape(batches, self.batch_size, processes)
-        return SizedPrefetcher(self._make_batch, lambda: windows[:, :, rank], self._ahead)
+        return SizedPrefetcher(self._make_batch, lambda: windows[:, :, rank], self.ahead)
 
     def order(self, step: int, rank: int = 0, processes: int = 1) -> Array:
         """Return the windows (B,) of training step `step` in process `rank`, as row numbers.

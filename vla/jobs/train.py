@@ -43,6 +43,7 @@ from vla.runs.folder import (
 from vla.runs.resume import LENGTHS, first_process, training_lock, training_progress
 from vla.training.checkpoints import GracefulStop
 from vla.training.closed_loop import ClosedLoop
+from vla.training.estimate import Estimate
 from vla.training.trainer import explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
 
 log = logging.getLogger(__name__)
@@ -72,7 +73,12 @@ def train(experiment: Experiment) -> Path | None:
     _warn_of_endless(experiment)
     with closed_loop or nullcontext(), training_lock(output / CHECKPOINTS):
         # Before collection, so that missing devices are reported early.
-        callbacks = [_Begun(experiment), *([closed_loop] if closed_loop else []), graceful_stop]
+        callbacks = [
+            Estimate(experiment.config),
+            _Begun(experiment),
+            *([closed_loop] if closed_loop else []),
+            graceful_stop,
+        ]
         trainer = make_trainer(experiment.config, output / CHECKPOINTS, *callbacks)
         if not trainer.is_global_zero:
             logging.getLogger("vla").setLevel(logging.WARNING)  # only the first process logs

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from typing import Any, Literal
 
 import torch
@@ -17,7 +18,10 @@ from vla.io.types import Natural, NonNegative, Positive, Rate
 from vla.models.compile_cache import set_compile_cache
 from vla.models.fsdp import local_shard, shard, unsharded
 from vla.models.layers import Batch
+from vla.models.lora import LoRA
 from vla.models.model import Model
+from vla.models.recomputation import recompute_layers
+from vla.models.trunk import evaluate_trunk, trunks
 from vla.spec import Spec, readable
 
 CHECK_FINITE_EVERY = 50  # steps
@@ -35,7 +39,9 @@ class Learner(LightningModule):
         compile: compile the model with torch.compile.
         ema: decay per step of the EMA weights, which are the ones evaluated and saved; 0 disables EMA.
         rates: part of the model, such as context or context.image, → factor of its learning rate.
-        frozen: parts that are not trained.
+        frozen: parts that are not trained, but for factors of LoRA in them.
+        lora: linear maps that learn by low-rank factors; None: none.
+        checkpointing: compute activations within layers again for the gradients, instead of keeping them.
         model: the model to train.
         spec: observation and action spaces; saved with every checkpoint.
         config: the resolved configuration as plain dicts and lists; saved with every checkpoint.
@@ -54,6 +60,8 @@ class Learner(LightningModule):
         ema: Rate,
         rates: dict[str, Positive] | None,
         frozen: list[str],
+        lora: LoRA | None = None,
+        checkpointing: bool = False,
         *,
         model: Model,
         spec: Spec,
@@ -66,7 +74,15 @@ class Learner(LightningModule):
         self._before: tuple[bool, str] | None = None  # flash attention and precision outside training
         self._non_finite_step: Tensor | None = None  # () on the device of the loss
         self.errors = nn.ModuleList(MeanMetric() for _ in spec.action)
+        self._scale = lora.scale if lora else 1.0
+        if lora:
+            lora.inject(model)
+        if checkpointing:
+            recompute_layers(model)
         self._groups()  # names of unknown parts are refused now, and frozen ones are frozen before they are distributed
+        self._trunks = trunks(model)
+        for name in self._trunks:
+            evaluate_trunk(model.get_submodule(name))
 
     def _groups(self) -> list[dict[str, Any]]:
         return self.model.parameter_groups(self._lr, self._weight_decay, self._rates, self._frozen)
@@ -209,6 +225,8 @@ class Learner(LightningModule):
         """
         self._require_finite()
         checkpoint["config"], checkpoint["spec"] = self._config, self._spec.to_dict()
+        checkpoint["trunks"] = {name: asdict(source) for name, source in self._trunks.items()}
+        checkpoint["lora_scale"] = self._scale
         measured = self.trainer.callback_metrics.items()
         checkpoint["figures"] = {name: float(value) for name, value in measured if name.startswith("val/")}
 

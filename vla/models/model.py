@@ -22,6 +22,7 @@ from vla.models.layers import Batch, RunningNormalizer, mean_where, newest
 from vla.models.text.ngrams import TextEncoder
 from vla.models.tokenizers.tokenizer import ActionTokenizer, PerComponent
 from vla.models.transforms import Fit, Resize, Transforms
+from vla.models.trunk import is_factor, is_within
 from vla.models.vision.image_tokenizer import ImageEncoder, RandomShift
 from vla.spec import Spec
 
@@ -192,7 +193,7 @@ class Model(nn.Module, ABC):
             learning_rate: of parts that `rates` does not name.
             weight_decay: of what decays.
             rates: part, such as "context" or "context.image", → factor of its learning rate; the longest name counts.
-            frozen: parts that are not trained.
+            frozen: parts that are not trained, but for factors of LoRA.
 
         Raises:
             UserError: a name is that of no part, or nothing is left to train.
@@ -201,14 +202,14 @@ class Model(nn.Module, ABC):
         _require_parts(parameters, "rates", rates)
         _require_parts(parameters, "frozen", frozen)
         for name, parameter in parameters.items():
-            if any(_is_within(name, part) for part in frozen):
+            if is_within(name, frozen) and not is_factor(name):
                 parameter.requires_grad_(False)
         trained = {name: parameter for name, parameter in parameters.items() if parameter.requires_grad}
         if not trained:
             raise UserError("learner.frozen leaves nothing to train")
         spared, groups = _embeddings(self), dict[tuple[float, bool], list[Tensor]]()
         for name, parameter in trained.items():
-            factor = rates[max(within, key=len)] if (within := [r for r in rates if _is_within(name, r)]) else 1.0
+            factor = rates[max(within, key=len)] if (within := [r for r in rates if is_within(name, [r])]) else 1.0
             decays = parameter.dim() > 1 and id(parameter) not in spared
             groups.setdefault((factor, decays), []).append(parameter)
         return [
@@ -219,13 +220,9 @@ class Model(nn.Module, ABC):
 
 def _require_parts(parameters: Collection[str], key: str, parts: Collection[str]) -> None:
     for part in parts:
-        if not any(_is_within(name, part) for name in parameters):
+        if not any(is_within(name, [part]) for name in parameters):
             known = ", ".join(dict.fromkeys(name.partition(".")[0] for name in parameters))
             raise UserError(f"learner.{key} names {part}, which no parameter of the model is in: it has {known}")
-
-
-def _is_within(name: str, part: str) -> bool:
-    return f"{name}.".startswith(f"{part}.")
 
 
 def _embeddings(model: nn.Module) -> set[int]:

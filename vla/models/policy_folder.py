@@ -10,7 +10,7 @@ import hashlib
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +24,8 @@ from vla.io.errors import UserError
 from vla.io.types import Natural
 from vla.models.hub import fetch
 from vla.models.model import Model
+from vla.models.trunk import Source, require_trunks, whole_state
+from vla.parallel.limits import free_memory, memory
 from vla.spec import Spec
 
 POLICY, BEST = "policy", "policy_best"  # in the folder of a run: its policy, and the best one in validation
@@ -52,6 +54,7 @@ class Training:
     weights: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]  # SHA-256 of their file
     versions: dict[str, str]  # library → version
     figures: dict[str, float]  # of the last validation
+    trunks: dict[str, Source] = field(default_factory=dict)  # part → where its weights are, which the file lacks
 
 
 @dataclass(frozen=True)
@@ -94,10 +97,12 @@ class SavedPolicy:
         """Load the weights, or another `state`, into `model`.
 
         Raises:
-            UserError: they belong to another model.
+            UserError: they belong to another model, or a trunk of it is not here.
         """
         state = self.state if state is None else state
+        require_trunks(model, self.training.trunks, self.folder)
         try:
+            state = whole_state(model, state, self.training.trunks)
             with self.budget():
                 model.load_state_dict(state)
             for name, value in (*model.named_parameters(), *model.named_buffers()):
@@ -108,8 +113,17 @@ class SavedPolicy:
             raise UserError(f"{self.folder} does not fit the model of its own configuration: {first}") from error
 
     def budget(self) -> TensorBudget:
-        """Return the context in which a model is built that its file can fill."""
-        return TensorBudget(self.folder, _file(self.folder, WEIGHTS).stat().st_size)
+        """Return the context in which a model is built that its file can fill, and the trunks that it names.
+
+        Raises:
+            UserError: the trunks are larger than the memory.
+        """
+        elsewhere = sum(source.size for source in self.training.trunks.values())
+        if elsewhere > (free := free_memory() * memory()):
+            raise UserError(
+                f"{self.folder} was trained on weights of {elsewhere / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free"
+            )
+        return TensorBudget(self.folder, _file(self.folder, WEIGHTS).stat().st_size + elsewhere)
 
 
 def policy_folder(name: str | Path) -> Path:

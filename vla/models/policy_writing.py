@@ -18,6 +18,8 @@ from vla.io.files import atomic_path, write_json
 from vla.io.versions import installed_versions
 from vla.models import policy_folder as files
 from vla.models.checkpoint import weights_of
+from vla.models.lora import without_lora
+from vla.models.trunk import Source
 
 TEXT = """---
 library_name: vla
@@ -58,7 +60,8 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
     states = [part for part in content.values() if isinstance(part, dict)]  # that of the data module among them
     windows = next((part["windows"] for part in states if isinstance(part.get("windows"), str)), "")
     figures = {name: value for name, value in content["figures"].items() if math.isfinite(value)}
-    state = weights_of(content)
+    named = {name: Source(**source) for name, source in content.get("trunks", {}).items()}
+    state = without_lora(weights_of(content), content.get("lora_scale", 1.0), named)
     # Contiguous, and without shared memory, as the format demands.
     tensors = {
         name: value.detach().cpu().clone(memory_format=torch.contiguous_format)
@@ -67,7 +70,7 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
     }
     weights = save(tensors, {name: json.dumps(value) for name, value in state.items() if name not in tensors})
     digest, steps, versions = hashlib.sha256(weights).hexdigest(), content["global_step"], installed_versions()
-    training = files.Training(steps, windows, seed, validation, digest, versions, figures)
+    training = files.Training(steps, windows, seed, validation, digest, versions, figures, named)
     count = sum(tensor.numel() for tensor in tensors.values())
     folder.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(folder) as draft:
@@ -90,6 +93,7 @@ def _card(config: Mapping[str, Any], spec: Mapping[str, Any], training: files.Tr
         "state": ", ".join(spec["state"]),
         "actions": f"{', '.join(spec['action'])} at {spec['control_hz']:g} Hz",
         "training": f"{training.steps} steps, seed {training.seed}, demonstrations {training.windows or 'unknown'}",
+        **{f"trunk {name}": f"{source}, not in this folder" for name, source in training.trunks.items()},
         **{name: f"{value:.4g}" for name, value in training.figures.items()},
     }
     table = "\n".join(f"| {name} | {text} |" for name, text in rows.items())

@@ -34,9 +34,9 @@ from vla.training.throughput import Throughput, TrainingProgressBar
 log = logging.getLogger(__name__)
 
 PRECISIONS = {"fp32": "32-true", "bf16": "bf16-mixed"}  # config → Lightning
+SIZE_KEYS = ("data.batch_size", "model.context.history", "model.image_size", "model.chunk", "model.width")
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 MAX_MMAP_THRESHOLD = 2**25  # [B]
-SIZE_KEYS = ("data.batch_size", "model.context.history", "model.image_size", "model.chunk", "model.width")
 
 
 class StepSeeding(Callback):
@@ -135,11 +135,16 @@ def explain_memory_errors(config: Mapping[str, Any]) -> Iterator[None]:
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, (MemoryError, torch.OutOfMemoryError)) and "can't allocate memory" not in str(error):
             raise
-        keys = [f"{key} (now {size})" for key in SIZE_KEYS if (size := at(config, key, None))]
-        raise UserError(
-            f"training needs more memory than available: lower {', '.join(keys)}; trainer.precision=bf16 needs less, "
-            "and trainer.accumulate_grad_batches=2 makes one step of two batches of half the size"
-        ) from error
+        raise UserError(f"training needs more memory than available: {what_to_lower(config)}") from error
+
+
+def what_to_lower(config: Mapping[str, Any]) -> str:
+    """Return which options to change for a training of less memory."""
+    keys = [f"{key} (now {size})" for key in SIZE_KEYS if (size := at(config, key, None))]
+    return (
+        f"lower {', '.join(keys)}; trainer.precision=bf16 and learner.checkpointing=true need less, and "
+        "trainer.accumulate_grad_batches=2 makes one step of two batches of half the size"
+    )
 
 
 def restore_metrics(trainer: Trainer, checkpoint: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -20,6 +19,7 @@ from vla.jobs.benchmark.measure import Measure, measure
 from vla.jobs.collect import demonstrations
 from vla.jobs.machine import computes_on_cpu, has_bfloat16
 from vla.runs.folder import CHECKPOINTS
+from vla.training.device import now
 from vla.training.trainer import PRECISIONS, explain_memory_errors, make_trainer, quiet_lightning
 
 log = logging.getLogger(__name__)
@@ -94,7 +94,7 @@ class Stopwatch(lightning.Callback):
     ) -> None:
         """Start the clock after the warm-up, and stop it after the last step."""
         if batch_idx + 1 in (WARM_UP, WARM_UP + self.steps):
-            self.seconds = _now(pl_module.device) - self.seconds
+            self.seconds = now(pl_module.device) - self.seconds
             self._batch = batch
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
@@ -102,19 +102,12 @@ class Stopwatch(lightning.Callback):
         model, optimizer = pl_module.model, torch.optim.AdamW(pl_module.model.parameters(), fused=True)
         for step in range(WARM_UP + self.steps):
             if step == WARM_UP:
-                self.alone = _now(pl_module.device)
+                self.alone = now(pl_module.device)
             optimizer.zero_grad()
             with trainer.precision_plugin.train_step_context():
                 loss = model.loss(model.augment(self._batch))["loss"]
             loss.backward()
             optimizer.step()
-        self.alone = _now(pl_module.device) - self.alone
+        self.alone = now(pl_module.device) - self.alone
         del self._batch
         pl_module.zero_grad()
-
-
-def _now(device: torch.device) -> float:
-    """Wait for the work of a device and return the time [s]."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()

@@ -19,6 +19,7 @@ from vla.io.suggestion import suggestion
 from vla.io.types import Pixels, Width
 from vla.models.hub import fetch
 from vla.models.packaged import PackagedFile
+from vla.models.trunk import Source
 from vla.models.vision.image_tokenizer import FiLM, ImageEncoder
 
 log = logging.getLogger(__name__)
@@ -169,6 +170,8 @@ def load_backbone(name: str, pretrained: Pretrained, size: int | None = None) ->
     except RuntimeError as error:
         raise UserError(f"{path} does not hold the weights of timm's {name}: {lines_of(error)[-1]}") from error
     del net.pretrained_cfg["state_dict"]
+    found = pretrained if isinstance(pretrained, str) and pretrained != "auto" else config.hf_hub_id or f"timm/{name}"
+    net.source = Source.of(path, pretrained.source if isinstance(pretrained, PackagedFile) else found)
     log.info("%s: weights loaded from %s", name, path)
     return net
 

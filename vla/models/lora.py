@@ -1,0 +1,107 @@
+"""LoRA: what a linear map learns is a product of two small matrices (E. Hu et al., arXiv 2106.09685).
+
+Shapes: r rank, I inputs and O outputs of a linear map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any
+
+from torch import nn
+
+from vla.io.errors import UserError
+from vla.io.types import Count, Names, Positive, Rate
+from vla.models.trunk import is_factor, is_within
+
+ADAPTER = "default"  # peft's name of the only one
+
+
+@dataclass(frozen=True)
+class LoRA:
+    """Linear maps whose (O, I) weight W is frozen, and becomes W + alpha / r · B A with trained B (O, r) and A (r, I).
+
+    Args:
+        modules: their dotted names, or those of parts with such maps; `*` stands for anything, and the beginning can be
+            left out: `q_proj`, `context`, `expert.*.v_proj`.
+        rank: r.
+        alpha: factor of the product, times r.
+        dropout: of the inputs of A.
+    """
+
+    modules: Names
+    rank: Count
+    alpha: Positive
+    dropout: Rate
+
+    @property
+    def scale(self) -> float:
+        """Return the factor of the product of the factors."""
+        return self.alpha / self.rank
+
+    def inject(self, model: nn.Module) -> None:
+        """Put the factors into a model, in place; what else it trains stays trained.
+
+        Raises:
+            UserError: a name is that of no linear map, or peft is not installed.
+        """
+        try:
+            from peft import LoraConfig, inject_adapter_in_model
+        except ImportError as error:
+            raise UserError("learner.lora needs peft: pip install -e '.[vlm]'") from error
+        chosen = self._chosen(model)
+        trained = {id(weight) for weight in model.parameters() if weight.requires_grad}
+        options: dict[str, Any] = {"r": self.rank, "lora_alpha": self.alpha, "lora_dropout": self.dropout}
+        inject_adapter_in_model(LoraConfig(target_modules=chosen, **options), model)  # freezes all but the factors
+        for name, weight in model.named_parameters():
+            weight.requires_grad_(is_factor(name) or (id(weight) in trained and ".base_layer." not in name))
+        for module in model.modules():
+            if isinstance(module, nn.TransformerEncoderLayer) and any(map(is_factor, module.state_dict())):
+                module.activation_relu_or_gelu = 0  # else it would read the weights past the factors, in evaluation
+
+    def _chosen(self, model: nn.Module) -> list[str]:
+        linear, chosen = list(_linear(model)), dict[str, None]()
+        for pattern in self.modules:
+            found = [name for name in linear if fnmatchcase(f".{name}.", f"*.{pattern}.*")]
+            if not found:
+                known = sorted({name.rpartition(".")[2] for name in linear})
+                parts = sorted({name.partition(".")[0] for name in linear})
+                raise UserError(
+                    f"learner.lora.modules names {pattern}, which no linear map of the model is called: they are "
+                    f"called {', '.join(known[:20])}, in {', '.join(parts)}"
+                )
+            chosen |= dict.fromkeys(found)
+        return list(chosen)
+
+
+def _linear(model: nn.Module, prefix: str = "") -> Iterator[str]:
+    """Yield the names of the linear maps that are called as modules, unlike those of torch's attention."""
+    for name, module in model.named_children():
+        if isinstance(module, nn.Linear):
+            yield prefix + name
+        elif not isinstance(module, nn.MultiheadAttention):
+            yield from _linear(module, f"{prefix}{name}.")
+
+
+def without_lora(state: Mapping[str, Any], scale: float, named: Collection[str]) -> dict[str, Any]:
+    """Return the state of a model as if there were no LoRA, and without the trunks `named`.
+
+    Weights get the product of their factors added. In a trunk the factors remain, as lora_A and lora_B, which has the
+    scale.
+    """
+    plain = dict[str, Any]()
+    for name, value in state.items():
+        layer, _, kind = name.partition(".base_layer.")
+        factor = f"{layer}.lora_%s.{ADAPTER}.weight"
+        if is_factor(name):
+            if is_within(name, named):
+                plain[name.removesuffix(f".{ADAPTER}.weight")] = scale * value if ".lora_B." in name else value
+        elif is_within(name, named):
+            continue
+        elif kind == "weight":
+            plain[f"{layer}.weight"] = value + scale * (state[factor % "B"] @ state[factor % "A"])
+        else:
+            plain[name.replace(".base_layer.", ".")] = value
+    return plain

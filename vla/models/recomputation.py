@@ -1,0 +1,49 @@
+"""Gradient checkpointing: activations within a layer are computed again for its gradients instead of being kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import torch
+from torch import nn
+from torch.utils.checkpoint import checkpoint
+
+from vla.io.errors import UserError
+from vla.models.fsdp import MIN_PARAMETERS
+
+
+def recompute_layers(model: nn.Module) -> None:
+    """Keep of every layer only its input, in place; its results and names stay.
+
+    Layers are the large elements of lists: those of transformers, ours as well as torch's, timm's and Hugging Face's.
+    The method of the latter's networks would not do: it is off in evaluation mode, in which a trunk is, and drops the
+    keys and values that an expert reads. Layers with buffers, as of batch normalisation, would update them twice.
+
+    Raises:
+        UserError: there are no such layers.
+    """
+    layers = list(_layers(model))
+    if not layers:
+        raise UserError(f"learner.checkpointing=true: {type(model).__name__} has no layers to compute again")
+    for layer in layers:
+        layer.forward = partial(_computed_again, layer.forward)
+
+
+def _layers(module: nn.Module) -> Iterator[nn.Module]:
+    """Yield the outermost layers."""
+    for child in module.children():
+        weights = dict(child.named_parameters())
+        in_list, large = isinstance(module, nn.ModuleList | nn.Sequential), MIN_PARAMETERS
+        composed = any("." in name for name in weights) and child.state_dict().keys() == weights.keys()
+        if in_list and composed and sum(weight.numel() for weight in weights.values()) >= large:
+            yield child
+        else:
+            yield from _layers(child)
+
+
+def _computed_again(forward: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    if not torch.is_grad_enabled():
+        return forward(*arguments, **named)
+    return checkpoint(forward, *arguments, use_reentrant=False, **named)

@@ -1,0 +1,42 @@
+"""Clock and memory of the device of a training."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
+import torch
+
+from vla.parallel.limits import free_memory, memory
+
+
+def now(device: torch.device) -> float:
+    """Wait for the work of a device and return the time [s]."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def memory_of(device: torch.device) -> tuple[float, float]:
+    """Return the memory that this process holds, and that it can get [bytes]."""
+    if device.type == "cuda":
+        return torch.cuda.memory_allocated(device), torch.cuda.mem_get_info(device)[0]
+    return psutil.Process().memory_info().rss, free_memory() * memory()
+
+
+def peak(device: torch.device) -> float:
+    """Return the largest memory of this process since `reset_peak` [bytes]."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def reset_peak(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    with suppress(OSError):  # elsewhere, and where it is forbidden, the largest of the whole process counts
+        Path("/proc/self/clear_refs").write_text("5")

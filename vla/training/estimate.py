@@ -1,0 +1,190 @@
+"""What a training needs of memory and time: said before it starts, and compared with what it took."""
+
+from __future__ import annotations
+
+import logging
+import statistics
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.utilities.seed import isolate_rng
+from torch import Tensor
+
+from vla.io.errors import UserError
+from vla.models.fsdp import local_shard
+from vla.models.learner import Learner
+from vla.training.device import memory_of, now, peak, reset_peak
+from vla.training.ema import EMA, EVERY
+from vla.training.trainer import what_to_lower
+
+log = logging.getLogger(__name__)
+
+TRIALS_S = 1.0  # trials of larger batches end after this time [s]
+TOLERANCE = 1.15  # a training is refused if it needs that much more than there is
+OPTIMIZED = 20_000_000  # numbers that a step of the optimiser is timed with
+GB = 1e9
+
+
+class Estimate(Callback):
+    """Estimates memory and time of a training from a few steps with small batches, without changing it.
+
+    Trials of 1, 4, 16, … windows end at the size of the training's batches, or once they take long; then lines through
+    the last two tell the rest. What trials lack is counted: optimiser state, EMA weights and waiting batches.
+
+    Args:
+        config: of the training, to name what can be lowered.
+    """
+
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        self._config, self._held, self._available = config, 0.0, 0.0  # [bytes]
+        self._peaks, self._seconds = dict[int, float](), dict[int, float]()  # windows → of a trial [bytes], [s]
+        self.memory, self.seconds = 0.0, 0.0  # estimated, of the process [bytes] and of a batch [s]
+        self._took: deque[float] = deque(maxlen=1000)  # by the last batches [s]
+        self._began: float | None = None
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Estimate; the model is on its device.
+
+        Raises:
+            UserError: the memory does not suffice.
+        """
+        assert isinstance(pl_module, Learner)
+        data: Any = trainer.datamodule  # type: ignore[attr-defined]
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        device, on_cpu = pl_module.device, pl_module.device.type == "cpu"
+        weights = [local_shard(weight) for weight in pl_module.parameters() if weight.requires_grad]
+        averaged = [*weights, *pl_module.buffers()] if any(isinstance(each, EMA) for each in callbacks) else []
+        self._held, free = memory_of(device)
+        self._available = (self._held + free) / (trainer.world_size // trainer.num_nodes if on_cpu else 1)
+        state = 2 * sum(each.nbytes for each in weights) + sum(each.nbytes for each in averaged)
+        self._require(self._held + state + sum(each.nbytes for each in weights))
+        self._peaks, self._seconds = {0: self._held}, {0: 0.0}
+        with _unchanged(pl_module):
+            window = self._try(trainer, pl_module, data)
+            optimizer = _optimizer_seconds(weights, device, bool(averaged))
+        waiting = (data.ahead + 1) * data.batch_size * window if on_cpu else 0
+        self.memory = extrapolated(self._peaks, data.batch_size) + state + waiting
+        self.seconds = extrapolated(self._seconds, data.batch_size) + optimizer / trainer.accumulate_grad_batches
+        self._require(self.memory)
+
+    def _require(self, needed: float) -> None:
+        if needed > TOLERANCE * self._available:
+            raise UserError(
+                f"training needs about {needed / GB:.1f} GB of memory, and {self._available / GB:.1f} GB are there: "
+                f"{what_to_lower(self._config)}"
+            )
+
+    def _try(self, trainer: Trainer, learner: Learner, data: Any) -> float:
+        """Run the trials, the same in all processes, and return the size of a window in a batch [bytes]."""
+        windows, began = 1, time.perf_counter()
+        while True:
+            batch = data.make_batch(data.order(0)[:windows])
+            window = sum(value.nbytes for value in _tensors(batch)) / windows
+            batch = learner.on_after_batch_transfer(learner.transfer_batch_to_device(batch, learner.device, 0), 0)
+            reset_peak(learner.device)
+            seconds = [_step(trainer, learner, batch) for _ in range(3 if windows == data.batch_size else 2)]
+            self._peaks[windows], self._seconds[windows] = peak(learner.device), statistics.median(seconds[1:])
+            if windows == data.batch_size:
+                return window
+            following = min(4 * windows, data.batch_size)
+            spent = time.perf_counter() - began + 2 * self._seconds[windows] * following / windows
+            fits = spent < TRIALS_S and extrapolated(self._peaks, following) < self._available
+            if not trainer.strategy.reduce_boolean_decision(fits, all=True):
+                if windows > 1:
+                    return window
+                following = 2
+            windows = following
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say what was estimated, for the steps that are left."""
+        batches = (trainer.max_steps - trainer.global_step) * trainer.accumulate_grad_batches
+        whole = (
+            f"{batches * self.seconds / 60:.1f} minutes for {batches} batches" if trainer.max_steps > 0 else "batches"
+        )
+        log.info(
+            "needs about %.2f of %.1f GB of memory, %.2f of which it has, and %s of %.0f ms, without validation; "
+            "if that is too much, %s",
+            *(self.memory / GB, self._available / GB, self._held / GB, whole, 1000 * self.seconds),
+            what_to_lower(self._config),
+        )
+        reset_peak(pl_module.device)
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Time the batch before, unless a validation came between."""
+        now = time.perf_counter()
+        if self._began is not None:
+            self._took.append(now - self._began)
+        self._began = now
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Leave a validation out."""
+        self._began = None
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say what the training took."""
+        if self._took:
+            log.info(
+                "took %.2f GB of memory and %.0f ms for a batch, after an estimate of %.2f GB and %.0f ms",
+                *(peak(pl_module.device) / GB, 1000 * statistics.median(self._took)),
+                *(self.memory / GB, 1000 * self.seconds),
+            )
+
+
+@contextmanager
+def _unchanged(learner: Learner) -> Iterator[None]:
+    """Leave random numbers, buffers and gradients as they are, and compute as in training, but not compiled."""
+    before = [buffer.clone() for buffer in learner.buffers()]
+    with isolate_rng(), torch.compiler.set_stance("force_eager"):
+        learner.on_fit_start()
+        try:
+            yield
+        finally:
+            learner.teardown("fit")
+    learner.zero_grad()
+    with torch.no_grad():
+        for buffer, value in zip(learner.buffers(), before, strict=True):
+            buffer.copy_(value)
+
+
+def _step(trainer: Trainer, learner: Learner, batch: Any) -> float:
+    """Return the time of a step without the optimiser [s]; as in training, gradients of the one before are there."""
+    began = now(learner.device)
+    with trainer.precision_plugin.train_step_context():
+        loss = learner.model.loss(learner.model.augment(batch))["loss"]
+    learner.zero_grad()
+    loss.backward()
+    return now(learner.device) - began
+
+
+def _optimizer_seconds(weights: list[Tensor], device: torch.device, averages: bool) -> float:
+    """Return the time of clipping, AdamW and EMA [s], from copies of some of the weights."""
+    some = list[Tensor]()
+    for weight in weights:
+        if sum(each.numel() for each in some) < OPTIMIZED:
+            some.append(torch.zeros_like(weight, requires_grad=True))
+            some[-1].grad = torch.zeros_like(weight)
+    optimizer, seconds = torch.optim.AdamW(some, fused=True), list[float]()
+    for _ in range(3):
+        began = now(device)
+        torch.nn.utils.clip_grad_norm_(some, 1.0)
+        optimizer.step()
+        seconds.append(now(device) - began)
+    share = sum(each.numel() for each in some) / sum(each.numel() for each in weights)
+    return min(seconds) / share * (1 + averages / (3 * EVERY))  # EMA reads and writes a third of what AdamW does
+
+
+def extrapolated(points: Mapping[int, float], size: int) -> float:
+    """Return the value at a size: the one that is there, or that of the line through the last two."""
+    (before, low), (last, high) = list(points.items())[-2:]
+    return points[size] if size in points else high + (high - low) / (last - before) * (size - last)
+
+
+def _tensors(batch: Any) -> list[Tensor]:
+    parts = batch.values() if isinstance(batch, dict) else ()
+    return [batch] if isinstance(batch, Tensor) else [each for part in parts for each in _tensors(part)]
