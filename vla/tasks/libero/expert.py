@@ -18,7 +18,7 @@ from vla.tasks.libero.situation import HELD, THIN, Situation
 from vla.tasks.libero.skills import approach, carry, command, drag, pull, push, twist, withdraw
 
 ORDER = ("open", "turnon", "on", "in", "close", "turnoff")  # in which parts of a goal are done
-DRAWERS = ("wooden_cabinet", "white_cabinet")  # what must be open for something to be put in
+DRAWERS = ("wooden_cabinet", "white_cabinet", "yellow_cabinet")  # what must be open for something to be put in
 NARROW = 0.006  # room about the hand below which a thing under something else is first dragged out [m]
 
 
