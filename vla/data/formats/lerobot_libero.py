@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from vla.data.formats.imported_demonstrations import Recording
 from vla.data.formats.lerobot_dataset import LeRobotDataset
 from vla.data.formats.lerobot_import import Keys, LeRobotDemonstrations, named
+from vla.io.errors import UserError
 from vla.io.types import Positive, Text
 from vla.spec import Array, Spec
 
@@ -46,6 +49,11 @@ class LiberoDemonstrations(LeRobotDemonstrations):
         factors = np.array([scale.get(name, 1.0) for name in spec.action], np.float32)
         self._opened = partial(_Dataset, action[0], factors, control_hz)
         super().__init__(folder, images, state, action, 1, spec=spec)
+
+    @classmethod
+    def recording(cls, **options: Any) -> Recording:
+        """Raise a UserError, as these are of a given task."""
+        raise UserError("expert=lerobot_libero is for task=libero: choose that task, or expert=lerobot")
 
 
 class _Dataset(LeRobotDataset):
