@@ -44,7 +44,7 @@ pytestmark = pytest.mark.usefixtures("recording")
 # Options that are only for some options of another group.
 TOGETHER = {
     ("evaluate", "lerobot"): ["task=metaworld"],
-    ("validate", "libero"): ["task=libero"],
+    **{(group, option): ["task=libero"] for group, option in (("validate", "libero"), ("evaluate", "libero_pro"))},
     ("tokenizer", "fast"): ["model=decoder"],
     ("job", "deploy"): ["deploy=ros2"],
     ("task/robot", "file"): [

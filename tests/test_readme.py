@@ -34,7 +34,7 @@ README = PAGES[0].read_text(encoding="utf-8")
 COMMANDS = [command for command in commands("vla.run") if command != "--help"]  # which is for `test_run`
 TOOLS = [(tool, command) for tool in ("say", "record") for command in commands(f"vla.deploy.{tool}")]
 HALF = "outputs/runs/half"
-METAWORLD = "metaworld"
+METAWORLD, LIBERO = "metaworld", "libero"
 STANDS = {
     "ENCODER": "encoder",
     "HOST": "127.0.0.1",
@@ -51,13 +51,14 @@ def test_all_the_commands_are_found() -> None:
 
 @pytest.fixture(scope="module")
 def folder(home: Path) -> Path:
-    """A folder with a RUN, with one that was interrupted as it trained for longer, and with a policy for Meta-World."""
+    """A folder with a RUN, one that was interrupted as it trained for longer, and policies of Meta-World and LIBERO."""
     trained = torch.load(home / "run/checkpoints/last.ckpt", weights_only=True)
     shutil.copytree(home / "run", home / HALF)
     torch.save(trained | {"finished": False}, home / HALF / "checkpoints/last.ckpt")
-    metaworld: Any = OmegaConf.to_container(composed("experiment=metaworld"), resolve=True)
-    shutil.copytree(home / "run/policy", home / METAWORLD)
-    change_json(home / METAWORLD / "config.json", lambda config: {**config, "task": metaworld["task"]})
+    for name, option in ((METAWORLD, "experiment=metaworld"), (LIBERO, "task=libero")):
+        other: Any = OmegaConf.to_container(composed(option), resolve=True)
+        shutil.copytree(home / "run/policy", home / name)
+        change_json(home / name / "config.json", lambda config, task=other["task"]: {**config, "task": task})
     return home
 
 
@@ -65,6 +66,8 @@ def arguments_of(command: str) -> list[str]:
     """The arguments, with what stands for the names in capital letters."""
     if "task.drawn=" in command:  # which a task of Meta-World has
         command = command.replace("checkpoint=RUN", f"checkpoint={METAWORLD}")
+    if "libero_pro" in command or "task.suite=" in command:
+        command = command.replace("checkpoint=RUN", f"checkpoint={LIBERO}")
     for name, path in STANDS.items():
         command = command.replace(name, path)
     return shlex.split(command)

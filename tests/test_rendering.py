@@ -29,7 +29,7 @@ from vla.spec import Array
 from vla.tasks import gl
 from vla.tasks.rendering import shapes
 from vla.tasks.rendering.context import Context
-from vla.tasks.rendering.fast import Fast, FastRenderer
+from vla.tasks.rendering.fast import Detailed, Fast, FastRenderer
 from vla.tasks.rendering.reference import Reference, ReferenceRenderer
 from vla.tasks.rendering.renderer import Renderer, Views
 from vla.tasks.tabletop.environment import Tabletop
@@ -234,6 +234,24 @@ def test_edges_are_smooth_where_asked() -> None:
         assert 0 < grey_levels(colours["plain"], colours[name])[0] < 6, name
         shades = [len(np.unique(colours[each].reshape(-1, 3), axis=0)) for each in (name, "plain")]
         assert shades[0] > shades[1]
+
+
+def test_textures_are_as_coarse_as_mujocos_where_asked() -> None:
+    text = """<mujoco><asset>
+      <texture name="skin" type="2d" builtin="flat" rgb1="1 .9 .8" mark="random" random=".4" markrgb="0 .1 .2"
+        width="256" height="256"/>
+      <material name="skin" texture="skin"/></asset><worldbody>
+      <geom type="plane" size="1 1 .1" material="skin"/><camera pos="0 -1.5 1" xyaxes="1 0 0 0 .55 .83"/>
+      </worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    data, drawn = mujoco.MjData(model), {}
+    mujoco.mj_forward(model, data)
+    for name, choice in {"mujoco": Reference(), "smooth": fast(samples=4), "detailed": Detailed()}.items():
+        renderer = choice.open(model, Views((0,), SIZE, SIZE))
+        drawn[name] = renderer.render(data)[0]
+        renderer.close()
+    smooth, detailed = (grey_levels(drawn["mujoco"], drawn[name])[0] for name in ("smooth", "detailed"))
+    assert detailed < 0.8 * smooth
 
 
 def test_renderers_share_a_context_and_draw_by_turns() -> None:

@@ -19,7 +19,7 @@ from vla.tasks.libero.scene import Detail, load_scene
 from vla.tasks.libero.starts import Starts, set_start
 
 SUITES = {"libero_spatial": "spatial", "libero_object": "object", "libero_goal": "goal", "libero_10": "long"}
-DETAIL = Detail(6000, 1500, 600, 256)  # of the pictures, which is to leave physics as it is
+DETAIL = Detail(6000, 2500, 3000, 256)  # of the pictures, which is to leave physics as it is
 
 
 def main() -> None:

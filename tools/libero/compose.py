@@ -27,6 +27,10 @@ from libero.libero.envs.env_wrapper import ControlEnv
 
 FIXTURE_SEED = 1  # initial states say nothing of fixtures, which every reset draws from NumPy's global generator
 KINDS = ("", "_swap", "_object", "_lan", "_task")
+SENTENCES = (
+    "_lan",
+    "_task",
+)  # of the problem, as LIBERO-PRO plays them; elsewhere, as published, those of the name of its file
 SUITES = [f"libero_{suite}{kind}" for kind in KINDS for suite in ("spatial", "object", "goal", "10")]
 FOLDERS = {
     "@robosuite": Path(robosuite.__file__).parent,
@@ -52,7 +56,7 @@ def composed(task: Any) -> tuple[str, dict[str, Any]]:
     model = env.sim.model._model
     fixtures = {name: env.obj_body_id[name] for name in env.fixtures_dict}
     facts = {
-        "instruction": task.language,
+        "instruction": outer.language_instruction if task.problem_folder.endswith(SENTENCES) else task.language,
         "problem": f"{task.problem_folder}/{task.bddl_file}",
         "states": f"{task.problem_folder}/{task.init_states_file}",
         "goal": env.parsed_problem["goal_state"],

@@ -80,6 +80,11 @@ class LeRobotDataset:
             raise UserError(f"expert.images: {folder} has no images {', '.join(unknown)}, it has {', '.join(keys)}")
         self.parts = self._read_parts([key for key in self.images.values() if self._is_video(key)])
 
+    @property
+    def control_hz(self) -> float:
+        """Rate of the actions [Hz]."""
+        return self.info.fps
+
     def components(self, keys: Sequence[str], anonymous: Sequence[str] = ()) -> dict[str, tuple[str, int]]:
         """Return component → its feature and index, of several features in order.
 

@@ -65,7 +65,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         spec: Spec,
     ) -> None:
         self.spec, self._every = spec.without_truth, every
-        self._dataset = dataset = _opened(folder, images)
+        self._dataset = dataset = self._opened(folder, images)
         features, ours = dataset.info.features, layout.features(spec, depth=True)
         self._state = dataset.components(state, [spec.state[index] for index in spec.pose])
         self._action = dataset.components(action, spec.action)
@@ -100,7 +100,7 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         cls, folder: Path | str | None, images: dict[str, Text] | None, state: Keys, action: Keys, every: Count
     ) -> Recording:
         """Describe a dataset, see `ImportedDemonstrations.recording`."""
-        dataset = _opened(folder, images)
+        dataset = cls._opened(folder, images)
         states, actions = dataset.components(state), dataset.components(action)
         values = dataset.read(action)
         return Recording(
@@ -151,10 +151,14 @@ class LeRobotDemonstrations(ImportedDemonstrations):
             log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * self._beyond)
         return super().fill(store, episodes)
 
+    @staticmethod
+    def _opened(folder: Path | str | None, images: dict[str, Text] | None) -> LeRobotDataset:
+        return LeRobotDataset(named(folder), images)
+
     def _mismatches(self) -> Iterator[str]:
         """Yield the differences between the spec and the metadata of the dataset."""
         dataset, spec = self._dataset, self.spec
-        if abs(dataset.info.fps / self._every - spec.control_hz) > layout.RATE_TOLERANCE * spec.control_hz:
+        if abs(dataset.control_hz / self._every - spec.control_hz) > layout.RATE_TOLERANCE * spec.control_hz:
             kept = f" and expert.every={self._every}" if self._every > 1 else ""
             yield f"a rate of {dataset.info.fps:g} Hz{kept}, the task has {spec.control_hz:g} Hz"
         if missing := [camera for camera in spec.cameras if camera not in dataset.images]:
@@ -207,7 +211,8 @@ def _shortened(names: Iterable[str]) -> str:
     return text if len(text) <= MAX_NAMES else f"{text[:MAX_NAMES]}…"
 
 
-def _opened(folder: Path | str | None, images: dict[str, Text] | None) -> LeRobotDataset:
+def named(folder: Path | str | None) -> Path:
+    """Require the folder of a dataset to be named."""
     if folder is None:
         raise UserError("expert=lerobot needs a dataset: name its folder with expert=lerobot expert.folder=DIR")
-    return LeRobotDataset(Path(folder), images)
+    return Path(folder)

@@ -14,7 +14,7 @@ from vla.parallel.limits import free_memory
 from vla.spec import FIRST_SEED, Array, Observation, Spec
 from vla.tasks.libero.controller import REACH, Controller
 from vla.tasks.libero.goal import Goal
-from vla.tasks.libero.package import ALL, SUITES, Task, tasks_of
+from vla.tasks.libero.package import ALL, Task, suites_of, tasks_of
 from vla.tasks.libero.scene import BURNER, VISIBLE, Detail, load_scene
 from vla.tasks.libero.starts import Starts, set_start
 from vla.tasks.rendering.renderer import Renderer, RendererFactory, Views
@@ -60,7 +60,7 @@ class Libero(World):
 
         Args:
             suite: a suite of LIBERO, "spatial", "object", "goal" or "long", or of LIBERO-PRO, such as "spatial_swap", a
-                list of these, or "all", the four of LIBERO.
+                list of these, or "all", the four of LIBERO, or "all_swap".
             tasks: numbers of the tasks in each suite; None: all ten.
             renderer: renderer of the images.
             image_size: height and width of every camera's images [px].
@@ -76,8 +76,8 @@ class Libero(World):
             UserError: the wheels are missing, or there is no such suite.
         """
         super().__init__()
-        suites = SUITES if suite == "all" else [suite] if isinstance(suite, str) else suite
         chosen = range(10) if tasks is None else tasks
+        suites = [name for each in ([suite] if isinstance(suite, str) else suite) for name in suites_of(each)]
         self._tasks = [tasks_of(name)[number] for name in suites for number in chosen]
         self.tasks = tuple(task.name for task in self._tasks)
         self._starts_of, self._limits, self._settle, self._mirror = starts, STEPS[steps], settle, mirror

@@ -19,7 +19,7 @@ from vla.tasks.libero.places import in_the_way, place_of
 from vla.tasks.libero.situation import HELD, THIN, Situation
 from vla.tasks.libero.skills import approach, carry, command, drag, pull, push, twist, withdraw
 
-DRAWERS = ("wooden_cabinet", "white_cabinet")  # what must be open for something to be put in
+DRAWERS = ("wooden_cabinet", "white_cabinet", "yellow_cabinet")  # what must be open for something to be put in
 HOLLOWS = (*DRAWERS, "microwave")  # into which things are brought all the way
 ARRIVED = 0.015  # distance at which they are [m]
 NARROW = 0.006  # room about the hand below which a thing under something else is first dragged out [m]

@@ -11,7 +11,11 @@ from vla.spec import Array
 
 # Prefix of a fixture's name → its joint is open below the first number and closed above the second [m, rad]
 # (libero/envs/objects/articulated_objects.py).
-DOORS = {"wooden_cabinet": (-0.14, 0.0), "white_cabinet": (-0.14, 0.0), "microwave": (-1.3, -0.005)}
+CABINET = (-0.14, 0.0)
+DOORS = {
+    **{f"{colour}_cabinet": CABINET for colour in ("wooden", "white", "yellow")},
+    "microwave": (-1.3, -0.005),
+}
 STOVE_ON = 0.5  # turn of the knob [rad]
 STOVE_OFF = 0.005
 NEAR = 0.03  # largest distance from the middle of a thing to lie on [m]

@@ -87,6 +87,12 @@ def _archive() -> dict[str, bytes]:
         return {member.name: archive.extractfile(member).read() for member in archive}  # type: ignore[union-attr]
 
 
+def suites_of(name: str) -> list[str]:
+    """Return the suites of a name: "all" is the four of LIBERO, "all_swap" those of LIBERO-PRO with this change."""
+    kind, _, change = name.partition("_")
+    return [f"{suite}_{change}" if change else suite for suite in SUITES] if kind == "all" else [name]
+
+
 @cache
 def tasks_of(suite: str) -> tuple[Task, ...]:
     """Return the tasks of a suite, such as "goal" or "spatial_swap", in the benchmark's order.

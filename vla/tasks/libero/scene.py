@@ -21,10 +21,15 @@ from vla.io.files import atomic_path
 from vla.spec import Array
 from vla.tasks.libero.package import scene_xml
 from vla.tasks.rendering.decimate import cache_folder, decimate
+from vla.tasks.rendering.shapes import mesh_texcoord, mesh_triangles
 
 VISIBLE = 1  # group of the geoms that are drawn; collisions are in group 0
 BURNER = "_burner"  # end of the name of a stove's glowing plate, a site
 WELD = 1e-6  # [m]
+METHOD = "without highlights on broad faces, more faces of fine things"  # part of the name of what is kept
+BROAD = 0.1  # area of a face above which MuJoCo, which lights vertices, shows no highlight within it [m²]
+FINE = 4  # a thing keeps one of so many faces where that is more than its detail, such as a basket's weave
+MOST = 3  # but so many times its detail at most
 
 Faces = Annotated[int, Ge(100)]
 
@@ -36,7 +41,7 @@ class Detail:
     Args of the config node `task.detail`.
     """
 
-    things: Faces  # of a mesh of what tasks are about
+    things: Faces  # of a mesh of what tasks are about, but see FINE
     robot: Faces  # of each of the robot's meshes
     rest: Faces  # of each other mesh
     texels: Annotated[int, Ge(16)]  # largest edge of a texture
@@ -53,7 +58,7 @@ def load_scene(name: str, things: Collection[str], detail: Detail | None) -> muj
     Raises:
         UserError: this MuJoCo cannot compile it.
     """
-    asked = f"{name} {sorted(things)} {detail} {mujoco.__version__}"
+    asked = f"{METHOD} {name} {sorted(things)} {detail} {mujoco.__version__}"
     path = cache_folder().parent / "libero" / f"{hashlib.sha256(asked.encode()).hexdigest()[:24]}.mjb"
     if not path.is_file():
         try:
@@ -77,13 +82,25 @@ def _light(xml: str, things: Collection[str], detail: Detail | None) -> mujoco.M
         if name.startswith(("robot0_", "gripper0_")):
             most = detail.robot
         if name.startswith(tuple(things)):
-            most = detail.things
+            fine = int(full.mesh_facenum[full.mesh(name).id]) // FINE
+            most = min(max(detail.things, fine), MOST * detail.things)
+        users = [geom for geom in meshes if geom.meshname == name]
+        if _largest_face(full, full.mesh(name).id) > BROAD:
+            for material in {geom.material for geom in users} - {""}:
+                spec.material(material).specular = 0
         if full.mesh_facenum[full.mesh(name).id] > most:
-            _thin(spec, full, name, most, [geom for geom in meshes if geom.meshname == name])
+            _thin(spec, full, name, most, users)
     for texture in spec.textures:
         if texture.file:
             _shrink(full, texture, detail.texels)
     return spec.compile()
+
+
+def _largest_face(model: mujoco.MjModel, mesh: int) -> float:
+    """Return the area of the largest face of a mesh [m²]."""
+    vertices, faces = mesh_triangles(model, mesh)
+    one, two, three = vertices[faces].swapaxes(0, 1)
+    return float(np.linalg.norm(np.cross(two - one, three - one), axis=1).max()) / 2
 
 
 def _invisible(xml: str) -> mujoco.MjModel:
@@ -122,14 +139,9 @@ def _welded(model: mujoco.MjModel, mesh: int) -> tuple[Array, Array, Array | Non
 
     Thinning would otherwise take every edge for a border, and keep it.
     """
-    first, start = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
-    vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
-    rows = slice(start, start + model.mesh_facenum[mesh])
+    vertices, faces = mesh_triangles(model, mesh)
     _, kept, places = np.unique(np.rint(vertices / WELD), axis=0, return_index=True, return_inverse=True)
-    faces = places.ravel()[model.mesh_face[rows]]
-    if model.mesh_texcoordadr[mesh] < 0:
-        return vertices[kept], faces, None
-    return vertices[kept], faces, model.mesh_texcoord[model.mesh_texcoordadr[mesh] + model.mesh_facetexcoord[rows]]
+    return vertices[kept], places.ravel()[faces], mesh_texcoord(model, mesh)
 
 
 def _shrink(full: mujoco.MjModel, texture: mujoco.MjsTexture, texels: int) -> None:

@@ -62,21 +62,37 @@ class Fast:
 
     def open(self, model: mujoco.MjModel, views: Views) -> Renderer:
         """Make a renderer of `model`; a UserError without EGL: a store names its renderer, so none replaces it."""
-        try:
-            context = shared_context()
-        except Exception as error:  # moderngl raises plain exceptions
-            raise UserError(
-                f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages "
-                f"{PACKAGES}, or choose task/renderer=mujoco"
-            ) from error
-        return FastRenderer(context, model, views, self)
+        return FastRenderer(_context(), model, views, self)
+
+
+@dataclass(frozen=True)
+class Detailed:
+    """Factory of the fast renderer with all faces, four samples per pixel, and textures as coarse as in MuJoCo, which
+    looks a texture up once per pixel, not once per sample."""
+
+    substitute = staticmethod(Fast.substitute)
+
+    def open(self, model: mujoco.MjModel, views: Views) -> Renderer:
+        """Make a renderer of `model`, or raise as `Fast.open`."""
+        return FastRenderer(_context(), model, views, Fast(samples=4, soft=0, faces=None), coarser=1)
+
+
+def _context() -> Context:
+    try:
+        return shared_context()
+    except Exception as error:  # moderngl raises plain exceptions
+        raise UserError(
+            f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages "
+            f"{PACKAGES}, or choose task/renderer=mujoco"
+        ) from error
 
 
 class FastRenderer:
     """Pictures of one model by OpenGL 3.3."""
 
-    def __init__(self, context: Context, model: mujoco.MjModel, views: Views, settings: Fast) -> None:
-        self._context, self._gl, self._settings = context, context.gl, settings
+    def __init__(self, context: Context, model: mujoco.MjModel, views: Views, settings: Fast, coarser: int = 0) -> None:
+        """Args: the context; model; views; settings; levels by which textures are coarser than samples need."""
+        self._context, self._gl, self._settings, self._coarser = context, context.gl, settings, coarser
         self._model, self._views = model, views
         self._cameras = ModelCameras(model, views)
         if missing := unsupported(model, views):
@@ -130,7 +146,7 @@ class FastRenderer:
         lamps = {1 + lights.index(lamp): bool(spot[lamp]) for lamp in self._lamps}
         kinds: tuple[shaders.Skin, ...] = ("none", "2d", "cube")
         self._programs = {
-            kind: gl.program(**shaders.scene_program(1 + len(lights), lamps, kind, pixel, settings.soft))
+            kind: gl.program(**shaders.scene_program(1 + len(lights), lamps, kind, pixel, settings.soft, self._coarser))
             for kind in kinds
         }
         units = {"poses": self._pose_texture, "table": self._table_texture}

@@ -68,7 +68,9 @@ vec3 shine(int number, vec3 place, vec3 normal, vec3 colour, vec4 material) {
 """
 
 
-def scene_program(lights: int, lamps: Mapping[int, bool], skin: Skin, pixel: bool, soft: int) -> dict[str, str]:
+def scene_program(
+    lights: int, lamps: Mapping[int, bool], skin: Skin, pixel: bool, soft: int, coarser: int
+) -> dict[str, str]:
     """Return the sources of the shaders of pictures.
 
     Args:
@@ -77,6 +79,7 @@ def scene_program(lights: int, lamps: Mapping[int, bool], skin: Skin, pixel: boo
         skin: kind of texture.
         pixel: whether to compute light per pixel instead of per vertex.
         soft: texels around the nearest one over which shadows are averaged.
+        coarser: levels that are added to those of textures.
     """
     count, spots = len(lamps), list(lamps.values())
     shared = f"""#version 330
@@ -94,7 +97,7 @@ layout(std140) uniform Camera {{
     shaded = _shaded(lights, list(lamps))
     return {
         "vertex_shader": shared + _vertex(passed, shaded, spots, skin, pixel),
-        "fragment_shader": shared + _fragment(passed, shaded, count, skin, pixel, soft),
+        "fragment_shader": shared + _fragment(passed, shaded, count, skin, pixel, soft, coarser),
     }
 
 
@@ -137,12 +140,13 @@ void main() {{
 }}"""
 
 
-def _fragment(passed: Sequence[str], shaded: str, count: int, skin: Skin, pixel: bool, soft: int) -> str:
+def _fragment(passed: Sequence[str], shaded: str, count: int, skin: Skin, pixel: bool, soft: int, coarser: int) -> str:
     samplers = [f"sampler2DShadow shadow{number}" for number in range(count)]
     samplers += {"none": [], "2d": ["sampler2D skin"], "cube": ["samplerCube skin"]}[skin]
     names = ", ".join(["base", *(f"lit{number}" for number in range(count))])
     local = f"vec3 {names};\n    {shaded.replace('normal,', 'normalize(normal),')}" if pixel else ""
     lit = [f"sum += lit{each} * max(unshadowed, shown(shadow{each}, shadow_at{each}));" for each in range(count)]
+    looked_up = f"texture(skin, coordinate{f', {coarser}.0' if coarser else ''})"
     return f"""
 uniform float unshadowed;
 uniform float alpha;
@@ -155,7 +159,7 @@ void main() {{
     {local}
     vec3 sum = base;
     {" ".join(lit)}
-    picture = vec4(sum, alpha) * {"vec4(1.0)" if skin == "none" else "texture(skin, coordinate)"};
+    picture = vec4(sum, alpha) * {"vec4(1.0)" if skin == "none" else looked_up};
 }}"""
 
 

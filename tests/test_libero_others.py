@@ -1,0 +1,219 @@
+"""What others measure and publish on LIBERO: LIBERO-PRO, controls for memory, served policies, human demonstrations."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pictures
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from command_line import here
+from composing import check, composed
+from PIL import Image, ImageOps
+from websockets.sync.server import ServerConnection, serve
+
+from vla.config.build import build
+from vla.config.experiment import Experiment
+from vla.data.episodes import EpisodeStore
+from vla.io.array_messages import pack, unpack
+from vla.io.errors import UserError
+from vla.rollouts.evaluate import play_episode
+from vla.rollouts.remote import RemotePolicy
+from vla.spec import FIRST_SEED, Array
+from vla.tasks.libero.environment import Libero, action_of, command_of
+from vla.tasks.libero.expert import Planner
+from vla.tasks.libero.package import CHANGES, SUITES, tasks_of
+
+PLAIN = [
+    *("task=libero", "task.image_size=[48,48]", "task.detail.things=300", "task.detail.robot=300"),
+    *("task.detail.rest=100", "task.detail.texels=32"),
+]
+ONE = [*PLAIN, "task.suite=object", "task.tasks=[0]"]
+CONDITIONS = ("positions", "objects", "sentences", "tasks")
+CLEAN = ("expert.perturb.noise=0", "expert.perturb.missed=0")
+QUIET = ("recorder=none", "cluster.workers=1", "logger=none")
+
+
+def world(*overrides: str) -> Libero:
+    """A world with small and plain pictures."""
+    made = Experiment.of(composed(*PLAIN, *overrides)).make_environment()()
+    assert isinstance(made, Libero)
+    return made
+
+
+def test_pictures_are_nearly_those_that_libero_hands_out(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of one task; docs/results/libero.md has all forty."""
+    with patch.object(sys, "argv", ["pictures.py", "task.suite=spatial", "task.tasks=[0]"]):
+        pictures.main()
+    assert max(map(float, capsys.readouterr().out.splitlines()[0].split()[1:])) < 5
+
+
+def test_libero_pro_changes_one_thing_at_a_time() -> None:
+    differing = {"swap": set(), "object": {"scene"}, "lan": {"instruction"}, "task": {"instruction", "goal"}}
+    for change in CHANGES:
+        differs: dict[str, list[bool]] = {"instruction": [], "goal": [], "scene": []}
+        for suite in SUITES:
+            for before, after in zip(tasks_of(suite), tasks_of(f"{suite}_{change}"), strict=True):
+                for name, found in differs.items():
+                    found.append(getattr(before, name) != getattr(after, name))
+        mostly = {name for name, found in differs.items() if np.mean(found) > 0.9}
+        never = {name for name, found in differs.items() if not any(found)}
+        assert differing[change] <= mostly, change
+        assert {"instruction", "goal"} - differing[change] <= never | ({"goal"} if change == "object" else set()), (
+            change
+        )
+
+
+@pytest.mark.parametrize("name", ["object_swap 0", "goal_object 8", "spatial_lan 0", "object_task 0"])
+def test_the_planner_plays_what_libero_pro_changes(name: str) -> None:
+    suite, number = name.split()
+    with closing(world(f"task.suite={suite}", f"task.tasks=[{number}]")) as environment, environment.blind():
+        expert, seen = Planner(spec=environment.spec), environment.reset(FIRST_SEED)
+        assert environment.draws["start"]["official"] == 0
+        while not environment.done:
+            seen = environment.step(expert.act(seen))
+    assert environment.outcome == "success"
+
+
+def test_libero_pro_is_an_evaluation_with_a_paired_difference_per_change(tmp_path: Path) -> None:
+    whole = composed("job=evaluate", "task=libero", "evaluate=libero_pro", "agent=expert")
+    check(whole)
+    changes = {name: f"{whole.task.suite}_{change}" for name, change in zip(CONDITIONS, CHANGES, strict=True)}
+    assert {name: one.suite for name, one in whole.evaluate.conditions.items()} == changes
+    asked = ["evaluate=libero_pro", "agent=expert", "evaluate.episodes=1", "output=pro", "evaluate.recordings=0"]
+    here(tmp_path, *ONE, *QUIET, *CLEAN, *asked, "~evaluate.conditions.objects", "~evaluate.conditions.tasks")
+    report = json.loads((tmp_path / "pro/report.json").read_text())
+    assert [report["conditions"][name]["success"] for name in ("positions", "sentences")] == [1.0, 1.0]
+
+
+def test_memory_is_measured_on_libero(tmp_path: Path) -> None:
+    here(tmp_path, "job=collect", *ONE, *QUIET, *CLEAN, "collect.episodes=2", "collect.folder=store")
+    asked = ["evaluate=memory", "evaluate.nearest=store", "evaluate.episodes=1", "output=memory", "agent=expert"]
+    here(tmp_path, *ONE, *QUIET, *CLEAN, *asked, "evaluate.recordings=0")
+    report = json.loads((tmp_path / "memory/report.json").read_text())
+    assert report["conditions"].keys() >= {"without_images", "without_instruction", "nearest"}
+
+
+@contextmanager
+def expert_behind_openpi(asked: list[dict[str, Any]]) -> Iterator[str]:
+    """A server as openpi's, by its URL, that gives the expert's commands to an episode that it plays along."""
+
+    def answer(connection: ServerConnection) -> None:
+        connection.send(pack({}))
+        with closing(world("task.suite=object", "task.tasks=[0]")) as environment, environment.blind():
+            expert, seen = Planner(spec=environment.spec), environment.reset(FIRST_SEED)
+            for data in connection:
+                assert isinstance(data, bytes)
+                asked.append(unpack(data))
+                np.testing.assert_allclose(asked[-1]["observation/state"], seen.state, atol=1e-4)
+                commands = np.zeros((10, 7), np.float32)
+                for command in commands[:5]:
+                    if not environment.done:
+                        action = expert.act(seen)
+                        command[:] = command_of(action)
+                        seen = environment.step(action)
+                connection.send(pack({"actions": commands, "server_timing": {"infer_ms": 1.0}}))
+
+    with serve(answer, "127.0.0.1", 0, compression=None) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        server.shutdown()
+
+
+def test_a_served_policy_is_judged_with_the_keys_of_openpi() -> None:
+    asked: list[dict[str, Any]] = []
+    with expert_behind_openpi(asked) as url, closing(world("task.suite=object", "task.tasks=[0]")) as environment:
+        picture = environment.reset(FIRST_SEED).rgb["agentview"]
+        config = composed(*ONE, "agent=remote_libero", f"agent.url={url}")
+        make = Experiment.of(config).make_agent()
+        policy = make(environment) if make else None
+        assert isinstance(policy, RemotePolicy)
+        with closing(policy):
+            result = play_episode(environment, policy, FIRST_SEED)
+    assert result.outcome == "success" and len(asked) == -(-(result.steps - 1) // 5)
+    first = asked[0]
+    assert first.keys() == {"observation/image", "observation/wrist_image", "observation/state", "prompt"}
+    assert first["prompt"] == "pick up the alphabet soup and place it in the basket"
+    assert first["observation/state"].shape == (8,) and first["observation/wrist_image"].shape == (224, 224, 3)
+    whole = ImageOps.pad(Image.fromarray(picture), (224, 224), Image.Resampling.BILINEAR)
+    np.testing.assert_array_equal(first["observation/image"], np.array(whole))
+
+
+def published(folder: Path, commands: list[Array], states: list[Array], picture: Image.Image) -> Path:
+    """A dataset of two episodes as LeRobot publishes LIBERO's."""
+    length, content = len(commands) // 2, io.BytesIO()
+    picture.save(content, "PNG")
+    cell, steps = {"bytes": content.getvalue(), "path": None}, np.arange(len(commands))
+    rows = {
+        "observation.state": pa.array([each.tolist() for each in states], pa.list_(pa.float32())),
+        "action": pa.array([each.tolist() for each in commands], pa.list_(pa.float32())),
+        **{f"observation.images.{name}": pa.array([cell] * len(commands)) for name in ("image", "image2")},
+        **{"timestamp": pa.array((steps % length / 10).astype(np.float32)), "frame_index": steps % length},
+        **{"episode_index": steps // length, "index": steps, "task_index": steps // length},
+    }
+    axes = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
+    image = {"dtype": "image", "shape": [256, 256, 3], "names": ["height", "width", "channel"]}
+    features = {
+        "observation.images.image": image,
+        "observation.images.image2": image,
+        "observation.state": {"dtype": "float32", "shape": [8], "names": {"motors": [*axes, "gripper"]}},
+        "action": {"dtype": "float32", "shape": [7], "names": {"motors": axes}},
+    }
+    episodes = {"episode_index": [0, 1], "dataset_from_index": [0, length], "dataset_to_index": [length, 2 * length]}
+    for path, table in (
+        ("data/chunk-000/file-000.parquet", rows),
+        ("meta/episodes/chunk-000/file-000.parquet", episodes),
+        ("meta/tasks.parquet", {"task_index": [0, 1], "task": ["put the bowl on the plate", "turn on the stove"]}),
+    ):
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.table(table), folder / path)
+    counts = {"total_episodes": 2, "total_frames": 2 * length}
+    (folder / "meta/info.json").write_text(
+        json.dumps({"codebase_version": "v3.0", "fps": 10, "features": features, **counts})
+    )
+    return folder
+
+
+def test_human_demonstrations_become_episodes_of_this_world(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    commands = [random.uniform(-1, 1, 7).astype(np.float32) for _ in range(6)]
+    for command in commands:
+        command[6] = np.sign(command[6])
+    states = [random.normal(size=8).astype(np.float32) for _ in range(6)]
+    picture = Image.fromarray(np.tile(np.arange(256, dtype=np.uint8)[:, None], (256, 1, 3)))
+    folder = published(tmp_path / "libero", commands, states, picture)
+    config = Experiment.of(composed(*PLAIN, "expert=lerobot_libero", f"expert.folder={folder}"))
+    with closing(world()) as environment:
+        spec = environment.spec
+        demonstrations = build(config["expert"], "expert", spec=environment.spec)
+    store = EpisodeStore.create_or_open(tmp_path / "store", spec.without_truth, {})
+    assert demonstrations.fill(store, 2) == 2
+    assert [entry.instruction for entry in store.episodes] == ["put the bowl on the plate", "turn on the stove"]
+    found = [store.read(entry) for entry in store.episodes]
+    np.testing.assert_array_equal(np.concatenate([one["state"] for one in found]), states)
+    np.testing.assert_allclose(
+        np.concatenate([one["action"] for one in found]), [action_of(one) for one in commands], atol=1e-6
+    )
+    left, right = found[0]["rgb_agentview"][0, 24, [2, 45], 0].astype(int)
+    assert left < 20 and right > 235  # neither mirrored once more nor cropped
+
+
+def test_a_dataset_of_something_else_ends_in_a_sentence(tmp_path: Path) -> None:
+    empty = [np.zeros(7, np.float32)] * 6
+    folder = published(tmp_path / "libero", empty, [np.zeros(7, np.float32)] * 6, Image.new("RGB", (256, 256)))
+    info = json.loads((folder / "meta/info.json").read_text())
+    info["features"]["observation.state"] |= {"shape": [7], "names": None}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    config = Experiment.of(composed(*PLAIN, "expert=lerobot_libero", f"expert.folder={folder}"))
+    with closing(world()) as environment, pytest.raises(UserError, match=r"state of 7 numbers .* the task has 8"):
+        build(config["expert"], "expert", spec=environment.spec)
