@@ -25,7 +25,7 @@ from vla.training.trainer import what_to_lower
 
 log = logging.getLogger(__name__)
 
-TRIALS_S, MANY = 1.0, 500  # trials of larger batches end after this time [s], unless a training has so many batches
+TRIALS_S, MANY = 2.0, 500  # trials of larger batches end after this time [s], unless a training has so many batches
 TOLERANCE = 1.15  # a training is refused if it needs that much more than there is
 OPTIMIZED = 20_000_000  # numbers that a step of the optimiser is timed with
 FIRST_STEP = 40e6  # of memory that libraries take for the first step, measured for four models [bytes]
@@ -35,7 +35,7 @@ GB = 1e9
 class Estimate(Callback):
     """Estimates memory and time of a training from a few steps with small batches, without changing it.
 
-    Trials of 1, 4, 16, … windows end at the size of the training's batches, or, in a short training, once they take
+    Trials of 2, 8, 32, … windows end at the size of the training's batches, or, in a short training, once they take
     long; then the line through the last two tells the rest. What trials lack is counted: optimiser state, EMA weights
     and waiting batches.
 
@@ -84,19 +84,19 @@ class Estimate(Callback):
 
     def _try(self, trainer: Trainer, learner: Learner, data: Any) -> float:
         """Run the trials, the same in all processes, and return the size of a window in a batch [bytes]."""
-        windows, began = 1, time.perf_counter()
+        windows, began = min(2, data.batch_size), time.perf_counter()  # batch normalisation needs two
         while True:
             batch = data.make_batch(data.order(0)[:windows])
             window = sum(value.nbytes for value in _tensors(batch)) / windows
             batch = learner.on_after_batch_transfer(learner.transfer_batch_to_device(batch, learner.device, 0), 0)
             reset_peak(learner.device)
             seconds = [_step(trainer, learner, batch) for _ in range(4 if windows == data.batch_size else 2)]
-            self._peaks[windows], self._seconds[windows] = peak(learner.device), min(seconds[1:])
+            self._peaks[windows], self._seconds[windows] = peak(learner.device), statistics.median(seconds[1:])
             if windows == data.batch_size:
                 return window
             following = min(4 * windows, data.batch_size)
             spent = time.perf_counter() - began + 2 * self._seconds[windows] * following / windows
-            soon = windows == 1 or spent < TRIALS_S or not 0 <= batches_left(trainer) < MANY
+            soon = spent < (TRIALS_S if windows > 2 else 5 * TRIALS_S) or not 0 <= batches_left(trainer) < MANY
             fits = extrapolated(self._peaks, following) < self._available
             if not trainer.strategy.reduce_boolean_decision(soon and fits, all=True):
                 return window
