@@ -13,6 +13,8 @@ from torch.utils.checkpoint import checkpoint
 from vla.io.errors import UserError
 from vla.models.fsdp import MIN_PARAMETERS
 
+LISTS = (nn.ModuleList, nn.Sequential)
+
 
 def recompute_layers(model: nn.Module) -> None:
     """Keep of every layer only its input, in place; its results and names stay.
@@ -32,15 +34,12 @@ def recompute_layers(model: nn.Module) -> None:
 
 
 def _layers(module: nn.Module) -> Iterator[nn.Module]:
-    """Yield the outermost layers."""
+    """Yield the innermost layers."""
     for child in module.children():
-        weights = dict(child.named_parameters())
-        in_list, large = isinstance(module, nn.ModuleList | nn.Sequential), MIN_PARAMETERS
+        inner, weights = list(_layers(child)), dict(child.named_parameters())
         composed = any("." in name for name in weights) and child.state_dict().keys() == weights.keys()
-        if in_list and composed and sum(weight.numel() for weight in weights.values()) >= large:
-            yield child
-        else:
-            yield from _layers(child)
+        large = sum(weight.numel() for weight in weights.values()) >= MIN_PARAMETERS
+        yield from inner or ([child] if isinstance(module, LISTS) and composed and large else [])
 
 
 def _computed_again(forward: Callable[..., Any], *arguments: Any, **named: Any) -> Any:

@@ -25,17 +25,19 @@ from vla.training.trainer import what_to_lower
 
 log = logging.getLogger(__name__)
 
-TRIALS_S = 1.0  # trials of larger batches end after this time [s]
+TRIALS_S, MANY = 2.0, 500  # trials of larger batches end after this time [s], unless a training has so many batches
 TOLERANCE = 1.15  # a training is refused if it needs that much more than there is
 OPTIMIZED = 20_000_000  # numbers that a step of the optimiser is timed with
+FIRST_STEP = 40e6  # of memory that libraries take for the first step, measured for four models [bytes]
 GB = 1e9
 
 
 class Estimate(Callback):
     """Estimates memory and time of a training from a few steps with small batches, without changing it.
 
-    Trials of 1, 4, 16, … windows end at the size of the training's batches, or once they take long; then lines through
-    the last two tell the rest. What trials lack is counted: optimiser state, EMA weights and waiting batches.
+    Trials of 2, 8, 32, … windows end at the size of the training's batches, or, in a short training, once they take
+    long; then the line through the last two tells the rest. What trials lack is counted: optimiser state, EMA weights
+    and waiting batches.
 
     Args:
         config: of the training, to name what can be lowered.
@@ -63,12 +65,12 @@ class Estimate(Callback):
         self._held, free = memory_of(device)
         self._available = (self._held + free) / (trainer.world_size // trainer.num_nodes if on_cpu else 1)
         state = 2 * sum(each.nbytes for each in weights) + sum(each.nbytes for each in averaged)
-        self._require(self._held + state + sum(each.nbytes for each in weights))
-        self._peaks, self._seconds = {0: self._held}, {0: 0.0}
+        self._peaks, self._seconds = {0: self._held + sum(each.nbytes for each in weights)}, {0: 0.0}  # with gradients
+        self._require(self._peaks[0] + state)
         with _unchanged(pl_module):
             window = self._try(trainer, pl_module, data)
             optimizer = _optimizer_seconds(weights, device, bool(averaged))
-        waiting = (data.ahead + 1) * data.batch_size * window if on_cpu else 0
+        waiting = (data.ahead + 2) * data.batch_size * window + FIRST_STEP if on_cpu else 0  # Lightning takes one ahead
         self.memory = extrapolated(self._peaks, data.batch_size) + state + waiting
         self.seconds = extrapolated(self._seconds, data.batch_size) + optimizer / trainer.accumulate_grad_batches
         self._require(self.memory)
@@ -82,31 +84,28 @@ class Estimate(Callback):
 
     def _try(self, trainer: Trainer, learner: Learner, data: Any) -> float:
         """Run the trials, the same in all processes, and return the size of a window in a batch [bytes]."""
-        windows, began = 1, time.perf_counter()
+        windows, began = min(2, data.batch_size), time.perf_counter()  # batch normalisation needs two
         while True:
             batch = data.make_batch(data.order(0)[:windows])
             window = sum(value.nbytes for value in _tensors(batch)) / windows
             batch = learner.on_after_batch_transfer(learner.transfer_batch_to_device(batch, learner.device, 0), 0)
             reset_peak(learner.device)
-            seconds = [_step(trainer, learner, batch) for _ in range(3 if windows == data.batch_size else 2)]
+            seconds = [_step(trainer, learner, batch) for _ in range(4 if windows == data.batch_size else 2)]
             self._peaks[windows], self._seconds[windows] = peak(learner.device), statistics.median(seconds[1:])
             if windows == data.batch_size:
                 return window
             following = min(4 * windows, data.batch_size)
             spent = time.perf_counter() - began + 2 * self._seconds[windows] * following / windows
-            fits = spent < TRIALS_S and extrapolated(self._peaks, following) < self._available
-            if not trainer.strategy.reduce_boolean_decision(fits, all=True):
-                if windows > 1:
-                    return window
-                following = 2
+            soon = spent < (TRIALS_S if windows > 2 else 5 * TRIALS_S) or not 0 <= batches_left(trainer) < MANY
+            fits = extrapolated(self._peaks, following) < self._available
+            if not trainer.strategy.reduce_boolean_decision(soon and fits, all=True):
+                return window
             windows = following
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say what was estimated, for the steps that are left."""
-        batches = (trainer.max_steps - trainer.global_step) * trainer.accumulate_grad_batches
-        whole = (
-            f"{batches * self.seconds / 60:.1f} minutes for {batches} batches" if trainer.max_steps > 0 else "batches"
-        )
+        batches = batches_left(trainer)
+        whole = f"{batches * self.seconds / 60:.1f} minutes for {batches} batches" if batches >= 0 else "batches"
         log.info(
             "needs about %.2f of %.1f GB of memory, %.2f of which it has, and %s of %.0f ms, without validation; "
             "if that is too much, %s",
@@ -179,10 +178,15 @@ def _optimizer_seconds(weights: list[Tensor], device: torch.device, averages: bo
     return min(seconds) / share * (1 + averages / (3 * EVERY))  # EMA reads and writes a third of what AdamW does
 
 
+def batches_left(trainer: Trainer) -> int:
+    """Return how many batches are left; below 0 without an end."""
+    return (trainer.max_steps - trainer.global_step) * trainer.accumulate_grad_batches
+
+
 def extrapolated(points: Mapping[int, float], size: int) -> float:
     """Return the value at a size: the one that is there, or that of the line through the last two."""
     (before, low), (last, high) = list(points.items())[-2:]
-    return points[size] if size in points else high + (high - low) / (last - before) * (size - last)
+    return points[size] if size in points else high + max(high - low, 0) / (last - before) * (size - last)
 
 
 def _tensors(batch: Any) -> list[Tensor]:
