@@ -37,11 +37,8 @@ class Grasp:
 def choose_grasp(at: Situation, thing: str, place: Place) -> Grasp | None:
     """Return the cheapest grasp from above of a thing that goes to a place; None: there is none."""
     points = at.points(thing)
-    kinds = (
-        (crest(points),)
-        if at.level(thing) < UPRIGHT
-        else (across(points), walls(points), parts(at.pieces(thing)), leaning(points))
-    )
+    tilted = np.abs(at.data.xmat[at.goal.bodies[thing], 6:]).max() < UPRIGHT  # whichever of its axes is up
+    kinds = (crest(points),) if tilted else (across(points), walls(points), parts(at.pieces(thing)), leaning(points))
     best: tuple[float, float, Grasp] | None = None
     for least, kind in zip(KINDS, kinds, strict=False):
         if best is not None and best[1] < least:

@@ -79,10 +79,6 @@ class Situation:
         """Return the origin (3,) of a thing [m]."""
         return self.data.xpos[self.goal.bodies[thing]]
 
-    def level(self, thing: str) -> float:
-        """Return the cosine of the tilt of a thing, whichever of its axes is up."""
-        return float(np.abs(self.data.xmat[self.goal.bodies[thing], 6:]).max())
-
     def pieces(self, thing: str, body: int | None = None) -> list[Array]:
         """Return points (N, 3) on each geom of a thing, or of one of its bodies [m]."""
         shapes = self._shapes[thing]

@@ -9,7 +9,7 @@ from vla.spec import Array
 from vla.tasks.libero.controller import REACH
 from vla.tasks.libero.grasps import LEAN, Grasp, parts
 from vla.tasks.libero.places import LOOSE, Place
-from vla.tasks.libero.room import HAND, PALM, TIP, axes
+from vla.tasks.libero.room import HAND, TIP, axes
 from vla.tasks.libero.situation import THIN, Situation
 
 GAIN = 3.0  # of the distance to go, in a command: less leaves the hand a centimetre away from where it is to be
@@ -24,7 +24,7 @@ SWEEP = 0.08  # distance to the line along which a thing is carried within which
 SLOW = 0.012  # by which the hand is ahead of what it drags, or it slips [m]
 BACK = 0.5  # lean of a hand that pushes [rad]
 EMPTY = 0.01  # largest distance of the fingers at which nothing worth keeping is between them [m]
-STRAIGHT = 0.99  # least cosine of the tilt of a thing that is let go
+STRAIGHT = 0.97  # least cosine of the tilt of a thing that is let go
 RESTS = 0.12  # height over its place at which a thing is let go if it lies on something there [m]
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -80,7 +80,13 @@ def carry(at: Situation, thing: str, place: Place) -> Array:
 
 def let_go(at: Situation, thing: str) -> Array:
     """Let go of a held thing, but if it hangs askew only once what is below it has righted it."""
-    hangs = at.level(thing) < STRAIGHT and at.hand[2] > at.points(thing)[:, 2].min() + PALM
+    points, axes_of = at.points(thing), at.data.xmat[at.goal.bodies[thing]].reshape(3, 3)
+    axis = int(np.argmax(np.abs(axes_of[2])))
+    up = axes_of[:, axis] * np.sign(axes_of[2, axis])  # of the thing
+    standing = (
+        at.hand @ up - (points @ up).min()
+    )  # height of the hand over what the thing stands on once it is straight
+    hangs = up[2] < STRAIGHT and at.hand[2] - points[:, 2].min() > standing + 0.002
     return command(at, at.hand - (0.01 * UP if hangs else 0.0), at.yaw, 1.0 if hangs else -1.0, at.lean)
 
 
