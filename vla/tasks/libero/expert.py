@@ -17,7 +17,7 @@ from vla.tasks.libero.grasps import choose_grasp, room_of
 from vla.tasks.libero.package import ALL, tasks_of
 from vla.tasks.libero.places import in_the_way, place_of
 from vla.tasks.libero.situation import HELD, THIN, Situation
-from vla.tasks.libero.skills import approach, carry, command, drag, pull, push, twist, withdraw
+from vla.tasks.libero.skills import approach, carry, command, drag, let_go, pull, push, twist, withdraw
 
 DRAWERS = ("wooden_cabinet", "white_cabinet", "yellow_cabinet")  # what must be open for something to be put in
 HOLLOWS = (*DRAWERS, "microwave")  # into which things are brought all the way
@@ -68,11 +68,13 @@ def decide(at: Situation) -> Array:
     touched = at.touched()
     held = touched if at.opening < HELD and at.gap > THIN else None
     if not todo or (touched is not None and all(at.subject(part[1]) != touched for part in todo)):
-        done = next((part for part in at.goal.parts if part[1] == held and part[0] == "in"), None)
-        if done is not None and todo and at.subject(done[2]).startswith(HOLLOWS):
+        done = next((part for part in at.goal.parts if todo and part[1] == held), None)
+        if done is not None and done[0] == "in" and at.subject(done[2]).startswith(HOLLOWS):
             place = place_of(at, done[1], done[2], True)
             if np.linalg.norm(place.spot - at.origin(done[1])) > ARRIVED:
                 return carry(at, done[1], place)  # it counts as there, but it is not down or not far enough in yet
+        if done is not None and done[0] == "on":
+            return let_go(at, done[1])
         return command(at, at.hand, at.yaw, -1.0, at.lean)
     part = next((part for part in todo if held is not None and part[1] == held), todo[0])
     if part[0] in ("on", "in") and _shut(at, part[2]):

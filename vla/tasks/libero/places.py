@@ -20,7 +20,7 @@ SQUARE = 0.01  # edge of the squares in which one point stands for all that are 
 STAY, REACHED = 0.5, 0.05  # cost per metre of a place from where the thing is, up to a distance: the choice then stays
 FLOOR = 0.012  # height over the floor of a region of what is in the way there [m]
 THICK = 0.03  # largest height of what carries things over the middle of a flat region [m]
-GRID = np.stack(np.meshgrid(*[np.linspace(-0.8, 0.8, 5)] * 2), axis=-1).reshape(-1, 2)
+GRID = np.stack(np.meshgrid(*[np.linspace(-0.8, 0.8, 7)] * 2), axis=-1).reshape(-1, 2)
 WAYS = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(16) * np.pi / 8])  # out from under a roof
 OBLIQUE = np.where(np.arange(len(WAYS)) % 4, 0.1, 0.0)  # costs of ways that are not along a wall [m]
 ROUND = 0.7  # least ratio of the variances along both sides of a thing that is not turned to be put down

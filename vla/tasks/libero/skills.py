@@ -24,6 +24,7 @@ SWEEP = 0.08  # distance to the line along which a thing is carried within which
 SLOW = 0.012  # by which the hand is ahead of what it drags, or it slips [m]
 BACK = 0.5  # lean of a hand that pushes [rad]
 EMPTY = 0.01  # largest distance of the fingers at which nothing worth keeping is between them [m]
+STRAIGHT = 0.97  # least cosine of the tilt of a thing that is let go
 RESTS = 0.12  # height over its place at which a thing is let go if it lies on something there [m]
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -66,13 +67,27 @@ def carry(at: Situation, thing: str, place: Place) -> Array:
     away = float(np.hypot(*offset[:2]))
     lies = offset[2] > -RESTS and place.slack == LOOSE and at.rests(thing)
     close = away < (0.03 if lies else min(0.015, place.slack))
-    if close and (lies or offset[2] > -0.012) and abs(place.turn) < TURNED:
+    if close and lies and abs(place.turn) < TURNED:
         return command(at, at.hand, yaw, -1.0, lean)
+    if close and offset[2] > -0.012 and abs(place.turn) < TURNED:
+        return let_go(at, thing)
     away += 0.1 * abs(place.turn)
     lift = min(FUNNEL * away, CARRY) if away > 0.6 * place.slack else 0.0
     if away > max(place.slack, 0.015):
         lift += max(0.0, _above(at, thing, place.spot))
     return command(at, rising(at, at.hand + offset + lift * UP), yaw, 1.0, lean)
+
+
+def let_go(at: Situation, thing: str) -> Array:
+    """Let go of a held thing, but if it hangs askew only once what is below it has righted it."""
+    points, axes_of = at.points(thing), at.data.xmat[at.goal.bodies[thing]].reshape(3, 3)
+    axis = int(np.argmax(np.abs(axes_of[2])))
+    up = axes_of[:, axis] * np.sign(axes_of[2, axis])  # of the thing
+    standing = (
+        at.hand @ up - (points @ up).min()
+    )  # height of the hand over what the thing stands on once it is straight
+    hangs = up[2] < STRAIGHT and at.hand[2] - points[:, 2].min() > standing + 0.002
+    return command(at, at.hand - (0.01 * UP if hangs else 0.0), at.yaw, 1.0 if hangs else -1.0, at.lean)
 
 
 def alike(at: Situation, grasp: Grasp) -> Grasp:
