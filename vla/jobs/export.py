@@ -17,7 +17,7 @@ def run(experiment: Experiment) -> None:
         UserError: the exporter needs a policy, and no checkpoint is given.
     """
     exporter = experiment.build("export")
-    if hasattr(exporter, "export_policy"):
-        log.info("wrote %s", exporter.export_policy(experiment.make_policy()()))
+    if getattr(exporter, "of_policies", False):
+        log.info("wrote %s", exporter.export(experiment.make_policy()()))
     else:
         log.info("wrote %s", exporter.export(demonstrations(experiment), experiment.cluster()))

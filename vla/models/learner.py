@@ -13,12 +13,13 @@ from torch import Tensor, distributed, nn
 from torchmetrics import MeanMetric
 
 from vla.io.errors import UserError
+from vla.io.printable import readable
 from vla.io.types import Natural, NonNegative, Positive, Rate
 from vla.models.compile_cache import set_compile_cache
 from vla.models.fsdp import local_shard, shard, unsharded
 from vla.models.layers import Batch
 from vla.models.model import Model
-from vla.spec import Spec, readable
+from vla.spec import Spec
 
 CHECK_FINITE_EVERY = 50  # steps
 NEVER = torch.iinfo(torch.int64).max  # first step with a non-finite loss, if there was none

@@ -20,8 +20,8 @@ from vla.io.files import write_text
 from vla.reports.factors import numeric
 from vla.reports.observations import reset_panels, spans
 from vla.reports.pictures import BLUE, GREEN, RED, Panels, plot_counts, save
-from vla.reports.tables import Table
-from vla.spec import Array, in_brackets
+from vla.reports.tables import Table, in_brackets
+from vla.spec import Array
 
 WORDS, SENTENCES = 8, 12  # maximum number of bars for words and for instructions
 FRAMES, COLUMNS = 4, 4  # episodes whose first images are shown, panels per row

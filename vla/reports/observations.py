@@ -12,9 +12,10 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 
 from vla.data.episode_filter import flat, leaves
+from vla.io.printable import readable
 from vla.reports.pictures import GREEN, MIDDLE, Panels, plot_image, save
 from vla.reports.tables import Table
-from vla.spec import Array, Observation, Spec, readable
+from vla.spec import Array, Observation, Spec
 
 SHOWN = 6  # windows of the first training batch
 

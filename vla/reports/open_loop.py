@@ -13,10 +13,9 @@ from matplotlib.axes import Axes
 
 from vla.io.files import write_json
 from vla.reports.pictures import BLUE, GREEN, GREY, MIDDLE, Panels, save
-from vla.reports.tables import Table
+from vla.reports.tables import Table, in_brackets
 from vla.rollouts.open_loop import OpenLoop
 from vla.runs.files import ComponentError
-from vla.spec import in_brackets
 
 
 def components(result: OpenLoop) -> list[ComponentError]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from vla.io.errors import UserError
 from vla.rollouts.rollout import AgentFactory, close_agent
-from vla.spec import Agent, Array, Environment, Expert, Observation
+from vla.spec import Agent, Array, Environment, Observation
 
 
 class Supervised:
@@ -52,7 +52,7 @@ class Supervised:
 
 def require_memoryless(expert: Agent) -> None:
     """Raise a UserError unless the expert's labels depend on the observation alone, as its `memoryless` says."""
-    if not (isinstance(expert, Expert) and expert.memoryless):
+    if not getattr(expert, "memoryless", False):
         raise UserError(
             f"{type(expert).__name__} cannot label the states of another agent: without memoryless = True its actions "
             "may depend on its earlier actions; choose another expert"

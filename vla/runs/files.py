@@ -17,11 +17,12 @@ from vla.config.nodes import Evaluation
 from vla.config.origin import Origin
 from vla.io.documents import LENIENT, STRICT
 from vla.io.errors import UserError
+from vla.io.printable import readable
 from vla.io.types import Count, Natural, NonNegative, Positive, Share
 from vla.rollouts.comparison import Comparison
 from vla.rollouts.motion import Motion
 from vla.rollouts.results import Report, Result
-from vla.spec import IN_DISTRIBUTION, readable
+from vla.spec import IN_DISTRIBUTION
 
 Node = dict[str, Any]
 # What reports read of a config, key → type; everything else is only shown.
