@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from vla.reports.comparison import compare_runs, read_runs, remarks, rows_of
+from vla.reports.comparison import compare, read_runs, remarks, rows_of
 from vla.reports.comparison_page import write_comparison
 from vla.reports.evaluation import write_report
 from vla.rollouts.comparison import compare_conditions
@@ -71,5 +72,5 @@ def a_run(
 def compared(folders: list[Path], target: Path) -> Path:
     """The page of `job=report`."""
     runs = read_runs(folders)
-    found, page = compare_runs(runs, 0.02), target / "comparison.html"
+    found, page = compare(combinations(rows_of(runs), 2), 0.02), target / "comparison.html"
     return write_comparison(page, f"{len(runs)} runs", rows_of(runs), found, remarks(runs, found))

@@ -90,7 +90,7 @@ NONSENSE = {
         evaluate.episodes=0 evaluate.seed=3 policy.precision=16
     """,
     "benchmark": """
-        benchmark.names=[] benchmark.names=[training] benchmark.precisions=[fp16] benchmark.rounds=0
+        benchmark.names=[] benchmark.names=[training] benchmark.precisions=[fp16] benchmark.compile=[]
     """,
     "inspect": """
         inspect.stores=[] inspect.folder=

@@ -8,10 +8,9 @@ import json
 import logging
 import re
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
 from html import unescape
-from multiprocessing import get_context
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +21,9 @@ from PIL import Image
 from toy_recordable import ThinkingAgent, make_environment
 
 from vla.config.differences import differences
-from vla.config.origin import Commit, Origin
+from vla.config.origin import Origin
 from vla.io.files import warn_on_error
-from vla.reports.comparison import compare_runs, read_runs
+from vla.reports.comparison import compare, read_runs, rows_of
 from vla.reports.evaluation import write_report
 from vla.reports.observations import draw_samples
 from vla.reports.run_page import write_page
@@ -144,13 +143,13 @@ def test_the_page_says_what_was_recorded_and_how_to_play_an_episode_again(
 
 
 def test_the_page_tells_the_command_the_commit_and_the_machine(tmp_path: Path) -> None:
-    trained = Origin("python -m vla.run model=bc", {"vla": Commit("0123456789abcdef", False)}, "ada", "EPYC, 2 cores")
+    trained = Origin("python -m vla.run model=bc", {"vla": "0123456789ab"}, "ada", "EPYC, 2 cores")
     folder = a_run(tmp_path / "run", more={"origin": asdict(trained)})
     save_training(folder, Training(1, 1, 1.0, "done", origins=[trained]))
     told = text(write_page(folder))
     where = "git commit 0123456789ab (vla) host ada processor EPYC, 2 cores"
     assert f"Origin command python -m vla.run model=bc {where}" in told
-    later = replace(trained, command="python -m vla.run", commits={"vla": Commit("0123456789abcdef", True)})
+    later = replace(trained, command="python -m vla.run", commits={"vla": "0123456789ab with uncommitted changes"})
     save_training(folder, Training(1, 1, 1.0, "done", origins=[later]))
     told = text(write_page(folder))
     assert "Origin of the training command python -m vla.run git commit 0123456789ab with uncommitted changes" in told
@@ -158,40 +157,6 @@ def test_the_page_tells_the_command_the_commit_and_the_machine(tmp_path: Path) -
     save_training(folder, Training(1, 1, 1.0, "done", origins=[trained, later]))
     told = text(write_page(folder))
     assert told.index("Origin of the training") < told.index("Origin of the training, part 2") < told.index("of the e")
-
-
-def test_a_folder_of_runs_lists_them_newest_first(tmp_path: Path) -> None:
-    runs = tmp_path / "runs"
-    for name, outcomes in (("a first", "ssss"), ("b <b>", "sdss")):
-        write_page(a_run(runs / name, outcomes))
-    (runs / "c").mkdir()
-    save_training(runs / "c", Training(1, 39, 3.0, "interrupted"))
-    page = write_page(runs / "c")
-    for name, content in (("other", "<p>of another program"), ("odd", '<meta name="vla-run" content="{}">')):
-        (runs / name).mkdir()
-        (runs / name / "report.html").write_text(content)
-    write_page(runs / "c")
-    told, markup = text(runs / "index.html"), (runs / "index.html").read_text()
-    assert told.startswith("3 runs ")
-    assert re.search(
-        r"c 20[\d-]+ [\d:]+ interrupted b <b> 20[\d-]+ [\d:]+ BC 75\.0 \(30\.1-95\.4\) 4 a first .* 100\.0", told
-    )
-    assert re.findall(r'href="([^"]*)"', markup) == [
-        "c/report.html",
-        "b%20%3Cb%3E/report.html",
-        "a%20first/report.html",
-    ]
-    assert "http" not in page.read_text() and "<b>" not in markup
-    write_page(a_run(tmp_path / "elsewhere/run"))
-    assert not (tmp_path / "elsewhere/index.html").exists()
-
-
-def test_of_runs_that_end_at_once_all_are_listed(tmp_path: Path) -> None:
-    folders = [a_run(tmp_path / f"runs/{n}") for n in range(4)]
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        list(pool.map(write_page, folders))
-    assert text(tmp_path / "runs/index.html").startswith("4 runs ")
-    assert not [path for path in (tmp_path / "runs").iterdir() if path.name.startswith(".") and "html" in path.name]
 
 
 def test_a_page_refers_to_nothing_outside_and_runs_nothing(whole: Path, tmp_path: Path) -> None:
@@ -244,8 +209,8 @@ def test_conditions_over_other_networks_are_not_compared(tmp_path: Path) -> None
         (tmp_path / name).mkdir()
         config = {"task": {}, "evaluate": {"networks": {"radio": {"latency": latency}}}}
         write_report(report, tmp_path / name / "report.json", None, config, {}, {"radio": report})
-    found = compare_runs(read_runs([tmp_path / "one", tmp_path / "other"]), 0.02)
-    assert [each.condition for each in found] == ["seen"]
+    found = compare(combinations(rows_of(read_runs([tmp_path / "one", tmp_path / "other"])), 2), 0.02)
+    assert [condition for _, _, condition in found] == ["seen"]
 
 
 def test_curves_have_axes_that_tell_most() -> None:
@@ -334,8 +299,8 @@ def test_episodes_without_draws_are_the_same_only_in_the_same_task(tmp_path: Pat
         task = {"id": run.name.replace("same", "one")}
         change(run, lambda content, task=task: content["config"].update(task=task))
         change(run, lambda content: [result.update(draws={}) for result in content["per_episode"]])
-    found = compare_runs(read_runs(runs), 0.02)
-    assert {(each.one, each.other) for each in found if each.condition == "seen"} == {("one", "same")}
+    found = compare(combinations(rows_of(read_runs(runs)), 2), 0.02)
+    assert {case[:2] for case in found if case[2] == "seen"} == {("same", "one")}
 
 
 def test_other_seeds_of_the_same_world_are_compared_as_they_are(tmp_path: Path) -> None:

@@ -52,7 +52,6 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     assert (report["experiment"], report["model"]) == ("none", "bc")
     assert {result["task"] for result in report["per_episode"]} == {"pick_place"}
     training = json.loads((home / "run/training.json").read_text())
-    assert report["wall_time_s"] > training["collection_s"] + training["seconds"] > training["collection_s"] > 0
     assert report["episodes"] == 2 and report["errors"] == 0
     assert report["versions"]["mujoco"] == mujoco.__version__
     assert report["config"]["collect"]["episodes"] == 12
@@ -87,7 +86,7 @@ def test_a_checkpoint_brings_its_task_and_model_and_takes_harder_scenes(home: Pa
     report = json.loads((home / "again/report.json").read_text())
     assert report["config"]["task"]["image_size"] == [32, 32]
     assert "purple" in report["config"]["task"]["randomize"]["colour"]["names"]
-    assert report["model"] == "bc" and report["wall_time_s"] > 0
+    assert report["model"] == "bc"
     refused = here(home, *arguments, "model=rt1_tiny", ok=False)
     assert refused.stderr.count("\n") == 1 and "model=rt1_tiny" in refused.stderr
 
@@ -198,7 +197,7 @@ def test_an_evaluation_ends_when_what_it_is_asked_is_decided(home: Path) -> None
     assert report["anytime"] and blind["anytime"] and 1 < blind["episodes"] < report["episodes"] < 40
     assert report["successes"] == 0 and report["ci_high"] < 0.5  # hardly trained
     assert report["statements"] == ["success is below the bar of 50 %"]
-    assert blind["comparison"]["verdict"] == "not worse by 90 points"
+    assert blind["compared"]["success"]["verdict"] == "not worse by 90 points"
     assert report["statements"][0] in done.stdout and "anytime-valid 95 % CI" in done.stdout.strip().splitlines()[-1]
     page = (home / "beside/report.html").read_text()
     assert report["statements"][0] in page and "anytime-valid" in page

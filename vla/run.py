@@ -27,7 +27,7 @@ from vla.config.check import check, devices
 from vla.config.compose import CONF, offer_axes, substitutes, with_variant
 from vla.config.compose import compose as compose_again
 from vla.config.experiment import Experiment
-from vla.config.packages import offer_options, trust, trust_own
+from vla.config.packages import offer_options, trust
 from vla.deploy import ros
 from vla.io.errors import UserError
 from vla.io.printable import printable
@@ -170,11 +170,8 @@ def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
     for key in ("resume", "checkpoint", "pretrained", "output"):
         if not isinstance(cfg[key], str | None) or (key == "output" and not cfg[key]):
             raise UserError(f"{key}={cfg[key]} is not a path: give a folder or file; a number is quoted, {key}=\\'3\\'")
-    named = [Path(each) for each in (cfg.resume, cfg.pretrained, cfg.checkpoint) if each is not None]
-    if not named:
+    if cfg.resume is cfg.pretrained is cfg.checkpoint is None:
         return cfg
-    for path in named:
-        trust_own(path)
     from vla.config.adopt import adopt, finetune, resume  # imports PyTorch, as the next one does
     from vla.runs.resume import interrupted_run
 

@@ -29,7 +29,6 @@ from vla.config.annotations import (
     mismatch,
     packages,
     require_trusted,
-    require_trusted_package,
     short,
     takes_path,
     targets,
@@ -163,7 +162,7 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
     values = {name: value for name, value in node.items() if name not in HYDRA_KEYS}
     check_arguments(key, values, target, runtime, partial, NARROWER.get(node["_target_"], {}))
     if "package" in node:
-        require_trusted_package(key, node["package"])
+        require_trusted(key, node["package"], imported=True)
 
 
 def check_arguments(
@@ -200,7 +199,7 @@ def require_trust(config: Mapping[str, Any], names: Iterable[Any], source: objec
     for target in targets(nodes):
         require_trusted(source, target)
     for package in packages(nodes):
-        require_trusted_package(source, package)
+        require_trusted(source, package, imported=True)
 
 
 def require_no_paths(

@@ -126,8 +126,6 @@ class Rounds:
     episodes: Count  # in every round
     seed: Seed  # of the first episode; the others follow it, round by round
     steps: Count  # of training after every round
-    beta: Share  # probability that the expert acts in a segment of an episode
-    segment: Count  # [steps]
     changes: Changes  # to the task in these episodes
 
     @property
@@ -182,10 +180,8 @@ class Benchmark:
     batches: Count  # of windows
     steps: Count  # of training and of the policy
     rounds: Count  # of training, interleaved
-    precisions: list[Literal["fp32", "bf16"]] | None  # None: those that are fast here
-    compile: list[bool]
-    robosuite: str | None  # Python interpreter with robosuite
-    lerobot: str | None  # Python interpreter with lerobot
+    precisions: Annotated[list[Literal["fp32", "bf16"]], MinLen(1)]
+    compile: Annotated[list[bool], MinLen(1)]
 
 
 def conditions(together: Mapping[str, Changes], one_by_one: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -13,7 +13,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 
 from vla.config.differences import ABSENT, at, differences
-from vla.reports.comparison import RunComparison, differences_table, secondary_differences
+from vla.reports.comparison import Compared, difference_tables
 from vla.reports.page import Section, render
 from vla.reports.pictures import COLOURS, Panels, error_bars, plot_rates, svgs
 from vla.reports.tables import Table, config_value, duration, links, percent, rate
@@ -29,7 +29,7 @@ FAILURES = 3  # moving pictures per run
 
 
 def write_comparison(
-    page: Path, title: str, rows: Sequence[SweepRow], compared: Sequence[RunComparison], remarks: Mapping[str, str]
+    page: Path, title: str, rows: Sequence[SweepRow], compared: Compared, remarks: Mapping[str, str]
 ) -> Path:
     """Write a page on rows and their comparisons, and return its path; a UserError if a moving picture is damaged.
 
@@ -44,8 +44,7 @@ def write_comparison(
         results_table(rows, page.parent),
         Section("Remarks", facts=remarks),
         Section("Success", panels=svgs(success_panels(rows)), lines=legend),
-        differences_table(compared),
-        secondary_differences(compared),
+        *difference_tables(compared),
         *training_sections([(colour, run.metrics) for _, colour, run in cells]),
         _config_differences(few),
         *(_failures(name, run) for name, run in few.items()),

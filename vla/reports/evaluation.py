@@ -21,13 +21,12 @@ def write_report(
     config: Mapping[str, Any],
     facts: Mapping[str, Any] | None = None,
     conditions: Mapping[str, Report] | None = None,
-    compared: Mapping[str, Comparison] | None = None,
-    secondary: Mapping[str, Mapping[str, Comparison]] | None = None,
+    compared: Mapping[str, Mapping[str, Comparison]] | None = None,
 ) -> None:
     """Write the report of the first condition as JSON atomically, with the evaluated policy and the resolved config.
 
     `facts` are further entries, such as chosen options, parameters and latency. `conditions` have other reports on the
-    same seeds, `compared` and `secondary` their comparisons with the first, in success and in milestones and motion.
+    same seeds, `compared` their comparisons with the first.
     """
     content = {
         **summary(report),
@@ -37,8 +36,7 @@ def write_report(
         "conditions": {
             name: {
                 **summary(other),
-                "comparison": asdict(compared[name]) if compared else None,
-                "secondary": {key: asdict(each) for key, each in (secondary or {}).get(name, {}).items()},
+                "compared": {key: asdict(each) for key, each in (compared or {}).get(name, {}).items()},
                 "outcomes": [result.outcome for result in other.results],
                 "reached": [result.milestones for result in other.results],
                 "motions": [result.motion and asdict(result.motion) for result in other.results],

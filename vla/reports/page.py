@@ -47,7 +47,7 @@ class Section:
 def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bool = False, **content: Any) -> Path:
     """Write a page of the parts that are not empty, atomically, and return its path.
 
-    Of a run `content` has `subtitle`, `warning`, the large `rate` and what it is `of`, and the `entry` of an index.
+    Of a run `content` has `subtitle`, `warning`, the large `rate` and what it is `of`.
     With `anytime` the results are valid whatever the reason to stop playing.
     """
     loader = FileSystemLoader(Path(__file__).parent)
@@ -55,7 +55,7 @@ def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bo
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(embedded=_embedded, in_words=in_words)
-    content = dict.fromkeys(("subtitle", "warning", "rate", "of", "entry"), "") | content
+    content = dict.fromkeys(("subtitle", "warning", "rate", "of"), "") | content
     text = environment.get_template("page.html").render(
         title=title,
         parts=[part for part in parts if part.rows],

@@ -7,13 +7,13 @@ from functools import partial
 from pathlib import Path
 
 from vla.reports.pictures import BLUE, RED, Panels, plot_rates, save
-from vla.reports.tables import DIFFERENCE, Table, difference, duration, in_words, percent, rate
-from vla.rollouts.comparison import Comparison
+from vla.reports.tables import DIFFERENCE, Table, difference, in_words, rate
+from vla.rollouts.comparison import SUCCESS, Comparison
 from vla.rollouts.motion import AMOUNTS
 from vla.rollouts.results import Report
 from vla.rollouts.sequential import LEVEL
-from vla.runs.files import Round
 
+CHAINS = "Instructions completed in a row"
 LEVELS = {"wide": BLUE, "hard": RED}  # end of a condition's name → colour
 TASKS = 40  # maximum number of tasks, over all conditions, that are tabulated
 
@@ -25,15 +25,9 @@ MOTION = (
     "Medians of the successful episodes, and their 95 % confidence intervals. Log jerk is the logarithm of the "
     "dimensionless jerk of the tool: 5.3 is the smoothest motion from rest to rest, every stop and tremor adds to it."
 )
-ROUNDS = (
-    "In every round the expert labelled what the policy of the round before saw, and training went on with that; a "
-    "round without episodes is the training on demonstrations alone. Validation has episodes of its own."
-)
-
-SecondaryRows = Mapping[tuple[str, ...], Mapping[str, Comparison]]  # words that begin a row → comparisons by name
 
 
-def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Comparison]) -> Table:
+def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Mapping[str, Comparison]]) -> Table:
     """Tabulate success and its interval per condition, and its comparison with the first condition.
 
     Rows below a condition are about each of its tasks, if it has several and the table stays short. Conditions that
@@ -45,7 +39,7 @@ def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Compa
     rows = []
     for name, report in reports.items():
         if name not in equal:
-            rows.append([name, *rate_of(report), *difference(compared.get(name))])
+            rows.append([name, *rate_of(report), *difference(compared.get(name, {}).get(SUCCESS))])
             tasks = report.tasks if detailed and len(report.tasks) > 1 else {}
             rows += [[f"  {task}", *rate_of(part), *difference(None)] for task, part in tasks.items()]
     note = f"as {first}, because they are as in training: {', '.join(equal)}" if equal else ""
@@ -60,14 +54,16 @@ def rate_of(report: Report, count: int | None = None) -> list[str]:
     return [rate((count / max(report.episodes, 1), *interval)), f"{count}/{report.episodes}"]
 
 
-def secondary_table(rows: SecondaryRows, heads: Sequence[str]) -> Table:
-    """Tabulate differences in milestones and motion, as `secondary_of` returns them; `heads` are those of the words."""
-    found = {name for metrics in rows.values() for name in metrics}
+def secondary_table(
+    compared: Mapping[tuple[str, ...], Mapping[str, Comparison]], heads: Sequence[str] = ("condition",)
+) -> Table:
+    """Tabulate differences in milestones and motion, in a row for every case with any; `heads` name the words of it."""
+    cases = {words: metrics for words, metrics in compared.items() if {*metrics} - {SUCCESS}}
+    found = {name for metrics in cases.values() for name in metrics} - {SUCCESS}
     names = [*(name for name in AMOUNTS if name in found), *sorted(found - {*AMOUNTS})]
     lines = [
         [*words, *(_secondary(name, metrics[name]) if name in metrics else "" for name in names)]
-        for words, metrics in rows.items()
-        if metrics
+        for words, metrics in cases.items()
     ]
     note = (
         "Milestones in all episodes, and medians of the differences in motion where both succeeded, with their 95 % "
@@ -97,30 +93,10 @@ def rate_tables(report: Report) -> list[Table]:
     return [
         Table(("tier", *heads), tiers, "Success by tier of difficulty", "" if report.anytime else TIERS),
         Table(("task", *heads), tasks, "Success by task"),
-        Table(
-            ("completed", "episodes [%]", "episodes"),
-            completed,
-            "Instructions completed in a row",
-            f"At least so many{mean}.",
-        ),
+        Table(("completed", "episodes [%]", "episodes"), completed, CHAINS, f"At least so many{mean}."),
         Table(("milestone", "reached [%]", "episodes"), milestones, "Milestones", "Whatever the outcome."),
         Table(("", "median", "episodes"), motion, "Motion", MOTION),
     ]
-
-
-def rounds_table(rounds: Sequence[Round]) -> Table:
-    """Tabulate the rounds of `job=improve`."""
-    first = int(bool(rounds) and rounds[0].episodes > 0)  # a round without episodes comes before the first one
-    rows = [
-        [
-            *(str(number), str(each.episodes), str(each.successes)),
-            "" if each.validation is None else percent(each.validation),
-            *(duration(each.collection_s), duration(each.training_s)),
-        ]
-        for number, each in enumerate(rounds, first)
-    ]
-    heads = ("round", "labelled episodes", "of these successes", "success in validation afterwards [%]")
-    return Table((*heads, "episodes took", "training took"), rows, "Rounds", ROUNDS)
 
 
 def plot_conditions(reports: Mapping[str, Report], path: Path) -> None:

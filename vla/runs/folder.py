@@ -109,21 +109,6 @@ def archive_evaluation(folder: Path, number: int) -> None:
         log.info("moved the evaluation so far to %s", target)
 
 
-def wall_time(policy: Path, evaluation: float) -> float | None:
-    """Return the wall time of collection, training and evaluation of a policy [s], or None if unknown.
-
-    `policy` is its folder, in that of the run that trained it, and `evaluation` the duration of the last part [s].
-    """
-    try:
-        training = read_training(policy.resolve().parent)
-    except (OSError, ValueError) as error:  # it only informs
-        log.warning("the wall time is unknown: %s", error)
-        return None
-    if training is None or training.collection_s is None:
-        return None
-    return round(training.collection_s + training.seconds + evaluation, 1)
-
-
 def require_run(folder: Path) -> Run:
     """Read a run's folder; a UserError if it has no report, errors of an open-loop evaluation, or metrics."""
     if not any((folder / name).is_file() for name in (REPORT, ERRORS, METRICS)):
