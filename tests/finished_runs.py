@@ -49,11 +49,12 @@ def a_run(
 ) -> Path:
     """A folder as an evaluation leaves it, without pictures and recordings.
 
-    s is a success, d a drop, e an error, and in the dark all are drops unless told. The report has `more` entries.
+    s is a success, d a drop, t a timeout, e an error; in the dark all are drops unless told. The report has `more`
+    entries.
     """
     folder.mkdir(parents=True)
     report, in_the_dark = (
-        a_report(*({"s": "success", "d": "dropped", "e": "error"}[outcome] for outcome in all_of_them))
+        a_report(*({"s": "success", "d": "dropped", "t": "timeout", "e": "error"}[outcome] for outcome in all_of_them))
         for all_of_them in (outcomes, dark or "d" * len(outcomes))
     )
     if light is not None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from composing import composed
 
 from vla.config.experiment import Experiment
-from vla.jobs.benchmark import acting, loader
+from vla.jobs.benchmark import loader
 from vla.jobs.benchmark.measure import machine, measure, other_load
 from vla.parallel.limits import cores
 
@@ -37,17 +35,3 @@ def test_large_images_are_loaded_and_their_size_is_extrapolated() -> None:
         speed, size = (found[f"loader: 3 x 224 px, {codec}{end}"] for end in ("", ", 2500 x 100 steps"))
         assert (speed["unit"], speed["n"], size["unit"]) == ("windows/s", 4, "GB") and speed["floor"] > 0
         assert 0 < size["value"] < 40 and size["floor"] == pytest.approx(112.9, abs=0.1)
-
-
-def test_a_deployment_is_measured_against_its_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ("image to command p50 [ms]", "inference p50 [ms]", "tick p99 [ms]")
-    operator = SimpleNamespace(status=dict(zip(names, ("30", "20", "21"), strict=True)), watchdog_delay=lambda: 0.25)
-    operator.play = operator.begin_episode = lambda: None
-    loop = SimpleNamespace(episodes=2, running=lambda: nullcontext(operator))
-    monkeypatch.setattr(acting, "deployment", lambda experiment: loop)
-    found = acting.deploy(Experiment.of(composed("job=benchmark", "deploy=loop")))
-    assert {name: (each["value"], each["floor"]) for name, each in found.items()} == {
-        "deploy: image to command": (30, 20),
-        "deploy: tick p99": (21, 20),
-        "deploy: watchdog": (250, 200),
-    }

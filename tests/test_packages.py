@@ -296,8 +296,3 @@ def test_libraries_cannot_be_trusted(name: str, monkeypatch: pytest.MonkeyPatch)
 def test_trust_is_a_list_of_packages(wrong: Any) -> None:
     with pytest.raises(ValueError, match=r"^trust (must be a list of packages|cannot name)"):
         packages.trust(wrong, [])
-
-
-def test_what_is_trusted_travels_with_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(packages.TRUSTED, "here")
-    assert packages.with_trust(["there"], packages.trusted) == ["here", "there"]

@@ -29,7 +29,7 @@ from vla.reports.observations import draw_samples
 from vla.reports.run_page import write_page
 from vla.reports.sweep import tabulate
 from vla.reports.training_curves import training_sections
-from vla.rollouts.moving_picture import Caption, read_moving_pictures, save_moving_picture
+from vla.rollouts.moving_picture import save_moving_picture
 from vla.rollouts.recorder import RerunRecorder
 from vla.rollouts.recordings import keep_recordings, shown
 from vla.rollouts.results import Report, Result
@@ -56,7 +56,7 @@ def pictures(page: Path) -> list[Image.Image]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that left everything, of the toy world."""
-    folder = a_run(tmp_path_factory.mktemp("runs") / "whole", "sssdsd")
+    folder = a_run(tmp_path_factory.mktemp("runs") / "whole", "ssstsd")
     save_training(folder, Training(1_500_000, 40, 400.0, "done"))
     environment, recorder = make_environment(), RerunRecorder(folder / "recordings", pictures=6)
     episodes = [rollout(environment, ThinkingAgent(), seed, recorder) for seed in SEEN]
@@ -83,7 +83,7 @@ def test_the_page_tells_everything_that_lies_in_the_folder(whole: Path) -> None:
         "checkpoint policy",
         "dark 0.0 (0.0-39.0) 0/6 -66.7 (-90.3 to -13.1) 0.12 0.12 open",  # four lost, none won: 2 / 2^4
         "timeout",
-        "seed 1000003, 40 steps",
+        "seed 1000003, 20 steps",
         "model.width 16 32",
     ):
         assert words in told, words
@@ -107,19 +107,14 @@ def test_failures_move_first_and_every_camera_is_shown(whole: Path) -> None:
     assert sorted(path.suffix for path in (whole / "recordings").iterdir()) == [".webp"] * 3
 
 
-def test_long_episodes_move_faster_and_their_words_are_kept(tmp_path: Path) -> None:
-    seen = replace(make_environment().reset(0), instruction="leg den roten Würfel 到左边")
-    later = replace(seen, instruction="danach <nichts>", rgb={})  # a step at which no camera was looked at
-    actions = np.zeros((200, 3), np.float32)
-    episode = Episode(
-        7, "a", seen.instruction, "dropped", frozenset(), {}, [seen] * 150 + [later] * 50, actions, actions
-    )
-    save_moving_picture(episode, [(3, "a push")], tmp_path / "one.webp")
-    assert read_moving_pictures(tmp_path) == {
-        Caption(7, "dropped", f"{seen.instruction}; then danach <nichts>", 200, ((3, "a push"),)): tmp_path / "one.webp"
-    }
-    blind = replace(episode, observations=[later])
-    save_moving_picture(blind, [], tmp_path / "none.webp")
+def test_long_episodes_move_faster(tmp_path: Path) -> None:
+    seen = make_environment().reset(0)
+    later, actions = replace(seen, rgb={}), np.zeros((200, 3), np.float32)  # a step at which no camera was looked at
+    observations = [seen] * 150 + [later] * 50
+    episode = Episode(7, "a", seen.instruction, "dropped", frozenset(), {}, observations, actions, actions)
+    save_moving_picture(episode, tmp_path / "one.webp")
+    assert Image.open(tmp_path / "one.webp").format == "WEBP"
+    save_moving_picture(replace(episode, observations=[later]), tmp_path / "none.webp")
     assert [path.name for path in tmp_path.iterdir()] == ["one.webp"]
 
 
@@ -186,7 +181,7 @@ def test_tasks_and_tiers_have_their_rates_and_their_mean(tmp_path: Path) -> None
     assert read_run(tmp_path).reports["seen"].tiers == tiers
     told = text(write_page(tmp_path))
     assert re.search(r"easy 100\.0 \(\d.* 3/3 very_hard 100\.0 \(.* 1/1 mean over tiers 100\.0", told)
-    assert "task success [%] episodes lift 100.0 (34.2-100.0) 2/2 push 100.0 (20.7-100.0) 1/1" in told
+    assert "task rate [%] episodes lift 100.0 (34.2-100.0) 2/2 push 100.0 (20.7-100.0) 1/1" in told
     write_report(Report(tuple(results[1:3])), tmp_path / "report.json", None, CONFIG)
     assert "Success by task" not in text(write_page(tmp_path))
 
@@ -242,7 +237,7 @@ def test_of_odd_metrics_what_can_be_drawn_is_drawn(tmp_path: Path) -> None:
     assert "<svg" in write_page(run).read_text()
     names = ",".join(f"loss{number}" for number in range(3000))
     (run / "metrics.csv").write_text(f"step,{names}\n9{',1' * 3000}\n")
-    with pytest.raises(ValueError, match=r"metrics\.csv is damaged in line 1: there are more than 300 columns"):
+    with pytest.raises(ValueError, match=r"metrics\.csv is damaged in line 1: .*more than 300"):
         write_page(run)
 
 
@@ -330,13 +325,6 @@ def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
     loop.symlink_to(loop)
     with pytest.raises(ValueError, match="loop is no run"):
         compared([loop], tmp_path / "new")
-    (run / "recordings").mkdir()
-    for content in (b"{", b"RIFF\0\0\0\0WEBP"):
-        (run / "recordings/one.webp").write_bytes(content)
-        with pytest.raises(ValueError, match=r"one\.webp cannot be read"):
-            read_moving_pictures(run / "recordings")
-    with pytest.raises(ValueError, match=r"one\.webp cannot be read"):
-        compared([run], tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 

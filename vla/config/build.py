@@ -116,10 +116,8 @@ def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
     """Build the object that a plain `node` of a group, or of its name in `GROUPS`, describes.
 
     Nested nodes are built first; those with `_partial_: true` become factories; `runtime` is from the program.
-    Unresolved references such as `${seed}` are refused, so the checked mapping is the one that is built.
-
-    Raises:
-        UserError: a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
+    Unresolved references such as `${seed}` are refused, so the checked mapping is the one that is built. There is a
+    UserError for a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
     """
     group = GROUPS[group] if isinstance(group, str) else group
     node = resolved(node, group.name)
@@ -144,11 +142,8 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
     """Check a plain node at `key` against the signature of its class, without the `runtime` arguments.
 
     A factory, a node with `_partial_: true`, lacks the arguments that its caller gives: keyword-only ones, and those
-    that programs give to a group. It belongs within another node only.
-
-    Raises:
-        UserError: the class is no `expected`, or a key is unknown, missing or ill-typed; with its dotted name and the
-            allowed values.
+    that programs give to a group. It belongs within another node only. There is a UserError if the class is no
+    `expected`, or a key is unknown, missing or ill-typed; with its dotted name and the allowed values.
     """
     if not is_node(node):
         raise UserError(f"{key} must be a node with a _target_, got {short(node)}")

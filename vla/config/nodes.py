@@ -78,8 +78,7 @@ class Validation:
 class Evaluation:
     """Episodes of an evaluation, what they are to decide, and further conditions on the same seeds.
 
-    Raises:
-        UserError: two conditions have one name.
+    There is a UserError if two conditions have one name.
     """
 
     episodes: Count  # with `until`, at most
@@ -175,7 +174,7 @@ class Inspection:
 class Benchmark:
     """Stages that `job=benchmark` measures, and how often."""
 
-    names: Annotated[list[Literal["collect", "loader", "train", "policy", "evaluate", "deploy", "serve"]], MinLen(1)]
+    names: Annotated[list[Literal["collect", "loader", "train", "policy", "evaluate"]], MinLen(1)]
     episodes: Count  # of the expert
     batches: Count  # of windows
     steps: Count  # of training and of the policy

@@ -32,7 +32,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 CONF = next(path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if (path / "config.yaml").is_file())
 
 
-class InstalledOptions(SearchPathPlugin):
+class _InstalledOptions(SearchPathPlugin):
     """Adds the options of installed packages to Hydra's search path, after those of `vla`, which take precedence."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
@@ -43,7 +43,7 @@ class InstalledOptions(SearchPathPlugin):
 
 def offer_options() -> None:
     """Register the options of installed packages with Hydra."""
-    Plugins.instance().register(InstalledOptions)
+    Plugins.instance().register(_InstalledOptions)
 
 
 @cache
@@ -144,12 +144,6 @@ def can_be_trusted(package: str) -> bool:
     if not package.isidentifier() or package.startswith("_") or package in sys.stdlib_module_names:
         return False
     return all(map(_made_for, packages_distributions().get(package, ())))
-
-
-def with_trust(names: list[str], function: Any, *arguments: Any, **named: Any) -> Any:
-    """Call a function in a process of this or another machine with the trust of the calling process."""
-    _trust_also(names)
-    return function(*arguments, **named)
 
 
 def _names(variable: str) -> list[str]:

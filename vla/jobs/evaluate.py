@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -48,7 +48,7 @@ from vla.runs.folder import (
     save_config,
 )
 from vla.runs.played import Played
-from vla.runs.resume import cached_success, training_lock
+from vla.runs.resume import cached_success
 from vla.spec import IN_DISTRIBUTION, Multitask
 
 log = logging.getLogger(__name__)
@@ -70,8 +70,7 @@ def run(experiment: Experiment) -> float | None:
         return evaluated(experiment, checkpoint)
     from vla.jobs.open_loop import evaluate_open_loop  # imports Lightning, which takes seconds, as training does
 
-    with _lock(experiment, checkpoint):
-        return evaluate_open_loop(experiment, checkpoint)
+    return evaluate_open_loop(experiment, checkpoint)
 
 
 def _trained(experiment: Experiment) -> Path | None:
@@ -81,7 +80,7 @@ def _trained(experiment: Experiment) -> Path | None:
     if experiment.playable or experiment.held_out:
         return train(experiment)
     log.warning("data.validation_fraction=0 trains on all episodes and leaves none to evaluate the policy on")
-    train(experiment.with_values({"job": "train"}))  # else resume=last would wait for an evaluation
+    train(experiment)
     return None
 
 
@@ -98,7 +97,6 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
     _ = experiment.origin  # of the code that is evaluated, not of later changes
     try:
         with (
-            _lock(experiment, checkpoint),
             Played(output, _identity(experiment, checkpoint)) as played,
             policy_for_workers(experiment, checkpoint) as make_policy,
         ):
@@ -121,12 +119,6 @@ def _identity(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]
     config = {name: node for name, node in experiment.config.items() if name not in NOT_COMPARED}
     weights = read_policy(checkpoint).training.weights if checkpoint else None
     return {"weights": weights, "versions": installed_versions(), "config": config}
-
-
-def _lock(experiment: Experiment, checkpoint: Path | None) -> AbstractContextManager[None]:
-    """Lock the training of a policy of this run, which resume=last would else find interrupted."""
-    own = checkpoint is not None and checkpoint.resolve().is_relative_to(experiment.output.resolve())
-    return training_lock(checkpoint.parent / CHECKPOINTS) if checkpoint and own else nullcontext()
 
 
 @contextmanager
@@ -208,9 +200,8 @@ def _play(
 def require_possible(experiment: Experiment) -> None:
     """Check, before any work, that the evaluation can be completed.
 
-    Raises:
-        UserError: there is no such run to compare with, nothing to decide, no such network or store, or no world to
-            change; or its episodes selected the weights.
+    There is a UserError if there is no such run to compare with, nothing to decide, no such network or store, or no
+    world to change; or its episodes selected the weights.
     """
     wanted, settings = experiment.evaluate, experiment.settings
     for name in (settings.checkpoint, settings.pretrained):
@@ -278,10 +269,9 @@ def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, R
     recording = output / RECORDING
     for earlier in (recording, output / SUITE):
         earlier.unlink(missing_ok=True)
-    if experiment["recorder"]:
+    if experiment["recorder"] and not _errors(reports):  # else the same command continues
         with warn_on_error(recording):
-            continues = _errors(reports) > 0
-            facts["recorded"] = keep_recordings(report, output / RECORDINGS, recording, wanted.recordings, continues)
+            facts["recorded"] = keep_recordings(report, output / RECORDINGS, recording, wanted.recordings)
     with warn_on_error(output / PLOT):
         (output / PLOT).unlink(missing_ok=True)  # of an earlier evaluation
         plot_report(report, output / PLOT)

@@ -13,8 +13,7 @@ log = logging.getLogger(__name__)
 def run(experiment: Experiment) -> None:
     """Export demonstrations or a policy, depending on the exporter.
 
-    Raises:
-        UserError: the exporter needs a policy, and no checkpoint is given.
+    There is a UserError if the exporter needs a policy, and no checkpoint is given.
     """
     exporter = experiment.build("export")
     if getattr(exporter, "of_policies", False):

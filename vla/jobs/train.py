@@ -55,15 +55,13 @@ def run(experiment: Experiment) -> None:
 def train(experiment: Experiment) -> Path | None:
     """Train, and return the folder of the policy that validation selects; None in all but the first process.
 
-    An unfinished training in the output folder is resumed; a finished one is kept.
-
-    Raises:
-        UserError: the output folder has another training, or this one cannot start.
+    An unfinished training in the output folder is resumed; a finished one is kept. There is a UserError if the output
+    folder has another training, or this one cannot start.
     """
     output = experiment.output
-    state = training_progress(output, experiment.config)
-    if state.chosen is not None:
-        return state.chosen if first_process() else None
+    last, chosen = training_progress(output, experiment.config)
+    if chosen is not None:
+        return chosen if first_process() else None
     quiet_lightning()
     graceful_stop, closed_loop = GracefulStop(output / CHECKPOINTS), _closed_loop(experiment)
     if experiment.trainer["max_steps"] in (None, -1) and experiment["learner"]["schedule"] == "cosine":
@@ -74,7 +72,7 @@ def train(experiment: Experiment) -> Path | None:
         trainer = make_trainer(experiment.config, output / CHECKPOINTS, *callbacks)
         if not trainer.is_global_zero:
             logging.getLogger("vla").setLevel(logging.WARNING)  # only the first process logs
-        _fit(experiment, state.resume_from, trainer, graceful_stop)
+        _fit(experiment, last, trainer, graceful_stop)
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()  # together: at their exit the others would wait for the first one
         if not trainer.is_global_zero:

@@ -12,9 +12,11 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from vla.io.documents import read_bounded
 from vla.io.files import write_text
 from vla.reports.tables import Table, in_words
-from vla.rollouts.moving_picture import Caption
+from vla.rollouts.moving_picture import LARGEST
+from vla.rollouts.results import Result
 
 WILSON = "Wilson's; those of several trainings account for correlation within trainings and within scenes"
 ANYTIME = "anytime-valid, by betting, because playing stopped as soon as it was clear"
@@ -35,7 +37,7 @@ class Section:
     facts: Mapping[str, str] = field(default_factory=dict)  # name → text or markup
     panels: Mapping[str, Markup] = field(default_factory=dict)  # title → SVG
     lines: Mapping[str, str] = field(default_factory=dict)  # name → colour in the panels
-    rollouts: Sequence[tuple[Caption, Path]] = ()
+    rollouts: Sequence[tuple[Result, Path]] = ()
     picture: Path | None = None
 
     @property
@@ -69,4 +71,4 @@ def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bo
 
 def _embedded(picture: Path) -> str:
     """Return a picture as a data URL."""
-    return f"data:image/{picture.suffix[1:]};base64,{b64encode(picture.read_bytes()).decode()}"
+    return f"data:image/{picture.suffix[1:]};base64,{b64encode(read_bounded(picture, LARGEST)).decode()}"

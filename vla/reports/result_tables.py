@@ -10,10 +10,9 @@ from vla.reports.pictures import BLUE, RED, Panels, plot_rates, save
 from vla.reports.tables import DIFFERENCE, Table, difference, in_words, rate
 from vla.rollouts.comparison import SUCCESS, Comparison
 from vla.rollouts.motion import AMOUNTS
-from vla.rollouts.results import Report
+from vla.rollouts.results import Counted, Report
 from vla.rollouts.sequential import LEVEL
 
-CHAINS = "Instructions completed in a row"
 LEVELS = {"wide": BLUE, "hard": RED}  # end of a condition's name → colour
 TASKS = 40  # maximum number of tasks, over all conditions, that are tabulated
 
@@ -39,19 +38,16 @@ def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Mappi
     rows = []
     for name, report in reports.items():
         if name not in equal:
-            rows.append([name, *rate_of(report), *difference(compared.get(name, {}).get(SUCCESS))])
+            rows.append([name, *_cells(report.counted()), *difference(compared.get(name, {}).get(SUCCESS))])
             tasks = report.tasks if detailed and len(report.tasks) > 1 else {}
-            rows += [[f"  {task}", *rate_of(part), *difference(None)] for task, part in tasks.items()]
+            rows += [[f"  {task}", *_cells(part.counted()), *difference(None)] for task, part in tasks.items()]
     note = f"as {first}, because they are as in training: {', '.join(equal)}" if equal else ""
     heads = ("condition", "success [%]", "episodes", *DIFFERENCE)
     return Table(heads, rows, "Success under other conditions, on the same seeds", note, ("p",))
 
 
-def rate_of(report: Report, count: int | None = None) -> list[str]:
-    """Return the rate of an event that `count` completed episodes had, by default of success, and both counts."""
-    interval = report.interval if count is None else report.interval_of(count)
-    count = report.successes if count is None else count
-    return [rate((count / max(report.episodes, 1), *interval)), f"{count}/{report.episodes}"]
+def _cells(found: Counted) -> list[str]:
+    return [rate((found.rate, found.ci_low, found.ci_high)), f"{found.count}/{found.of}"]
 
 
 def secondary_table(
@@ -82,19 +78,17 @@ def _secondary(name: str, found: Comparison) -> str:
 
 def rate_tables(report: Report) -> list[Table]:
     """Tabulate success by tier and task, instructions completed in a row, milestones and motion."""
-    heads = ("success [%]", "episodes")
-    tiers = [[name, *rate_of(part)] for name, part in report.by_tier.items()]
-    tiers += [[report.mean_label, rate(report.mean_over_tiers), ""]] if report.mean_over_tiers else []
-    tasks = [[name, *rate_of(part)] for name, part in report.by_task.items()]
-    completed = [[name, *rate_of(report, count)] for name, count in report.in_a_row.items()]
+    rows = {kind: [[name, *_cells(each)] for name, each in rates.items()] for kind, rates in report.rates.items()}
+    if report.mean_over_tiers:
+        rows["tiers"].append([report.mean_label, rate(report.mean_over_tiers), ""])
     mean = "; on average {:.2f} ({:.2f}-{:.2f})".format(*report.mean_in_a_row) if report.mean_in_a_row else ""
-    milestones = [[name, *rate_of(report, count)] for name, count in report.milestones.items()]
     motion = [[AMOUNTS[name], str(median), str(median.episodes)] for name, median in report.medians.items()]
+    heads = ("rate [%]", "episodes")
     return [
-        Table(("tier", *heads), tiers, "Success by tier of difficulty", "" if report.anytime else TIERS),
-        Table(("task", *heads), tasks, "Success by task"),
-        Table(("completed", "episodes [%]", "episodes"), completed, CHAINS, f"At least so many{mean}."),
-        Table(("milestone", "reached [%]", "episodes"), milestones, "Milestones", "Whatever the outcome."),
+        Table(("tier", *heads), rows["tiers"], "Success by tier of difficulty", "" if report.anytime else TIERS),
+        Table(("task", *heads), rows["tasks"], "Success by task"),
+        Table(("completed", *heads), rows["in_a_row"], "Instructions completed in a row", f"At least so many{mean}."),
+        Table(("milestone", *heads), rows["milestones"], "Milestones reached", "Whatever the outcome."),
         Table(("", "median", "episodes"), motion, "Motion", MOTION),
     ]
 

@@ -13,8 +13,7 @@ from vla.reports.pictures import GREEN, svgs
 from vla.reports.result_tables import conditions_table, rate_tables, secondary_table
 from vla.reports.tables import Table, config_value, duration, in_words, links, percent
 from vla.reports.training_curves import training_sections
-from vla.rollouts.moving_picture import read_moving_pictures
-from vla.rollouts.recordings import shown
+from vla.rollouts.recordings import pictured, shown
 from vla.rollouts.results import ERROR
 from vla.runs.folder import ERRORS_PLOT, PAGE, RECORDING, RECORDINGS, SAMPLES, Run, read_run
 from vla.spec import IN_DISTRIBUTION
@@ -110,9 +109,10 @@ def _facts(run: Run) -> dict[str, str]:
 
 def _rollouts(run: Run) -> Section:
     """Return the moving pictures, what the recording has, and how to play an episode again."""
-    pictures, facts = read_moving_pictures(run.folder / RECORDINGS), dict[str, str]()
+    results = [each for each in run.report.per_episode if each.outcome != ERROR] if run.report else []
+    pictures, facts = pictured(results, run.folder / RECORDINGS), dict[str, str]()
     if (run.folder / RECORDING).is_file() and run.report:
-        results, recorded = [each for each in run.report.per_episode if each.outcome != ERROR], {*run.report.recorded}
+        recorded = {*run.report.recorded}
         counts = [
             f"{sum(each.seed in recorded for each in played)} of {len(played)} {name}"
             for name, good in (("failures", False), ("successes", True))
@@ -121,7 +121,8 @@ def _rollouts(run: Run) -> Section:
         facts["recording"] = links({RECORDING: RECORDING}) + f" has {' and '.join(counts)}; rerun {RECORDING} plays it"
         policy = f"checkpoint={_near(Path(run.report.checkpoint))} " if run.report.checkpoint else ""
         facts["another one"] = f"{policy}evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
-    return Section("Rollouts", ROLLOUTS, facts, rollouts=[(caption, pictures[caption]) for caption in shown(pictures)])
+    moving = shown(each for each in results if each.seed in pictures)
+    return Section("Rollouts", ROLLOUTS, facts, rollouts=[(each, pictures[each.seed]) for each in moving])
 
 
 def _origins(run: Run) -> list[Section]:

@@ -73,12 +73,9 @@ def collect(
     """Roll the expert out on `seed`, `seed` + 1, … until the store holds `episodes` successes.
 
     Existing episodes are kept. If another process is collecting into the same store, wait for it. Each process of
-    `cluster` calls the two factories once. `multitask` tells the task of a seed; its
-    tasks get equal shares. With `keep_failures` every seed gives an episode: failures are stored and count too.
-
-    Raises:
-        UserError: the store starts at another seed or is derived, the expert fails persistently, workers died, or the
-            disk is full.
+    `cluster` calls the two factories once. `multitask` tells the task of a seed; its tasks get equal shares. With
+    `keep_failures` every seed gives an episode: failures are stored and count too. There is a UserError if the store
+    starts at another seed or is derived, the expert fails persistently, workers died, or the disk is full.
     """
     started, before = time.monotonic(), len(store.episodes)
     store.require_first_seed(seed)
@@ -106,7 +103,7 @@ def _fill_with(cluster: Cluster, make: WorkerFactory, store: EpisodeStore, fill:
             log.warning("workers were lost after %d episodes; continuing with new ones", len(store.episodes))
 
 
-class Attempts:
+class _Attempts:
     """Episodes in the order of their seeds.
 
     They are rolled out in advance for tasks that would need more even if all pending episodes succeed.
@@ -171,7 +168,7 @@ def _fill(
     store: EpisodeStore, episodes: int, seed: int, multitask: Multitask | None, keep_failures: bool, pool: Pool
 ) -> None:
     """Append episodes until there are so many, or the expert fails too often in a row."""
-    before, attempts, started = len(store.episodes), Attempts(pool, multitask, store, seed), time.monotonic()
+    before, attempts, started = len(store.episodes), _Attempts(pool, multitask, store, seed), time.monotonic()
     outcomes = Counter(entry.success for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED))
     in_a_row = defaultdict[str, list[str]](list)  # task → outcomes of the failures since its last success
     columns = (TextColumn("collecting"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))

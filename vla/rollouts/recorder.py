@@ -20,6 +20,7 @@ from vla.io.errors import UserError
 from vla.io.files import atomic_path
 from vla.io.types import Natural, Point
 from vla.rollouts.moving_picture import save_moving_picture
+from vla.rollouts.results import recording_name
 from vla.spec import Array, Environment, Episode, HasScene, Observation, Shape, Spec
 
 # N steps, S series of a plot, D action components, K bins, V vertices, F faces
@@ -28,11 +29,6 @@ VIEWER = str(Path(rerun_cli.__file__).with_name("rerun"))  # the binary: killing
 CURVES = np.array([0xE5574CFF, 0x5ABE64FF, 0x508CF0FF, 0xF0AA3CFF, 0xB46EE6FF, 0x3CC8C8FF, 0xDCDCDCFF], np.uint32)
 EVENTS = "events"  # entity of the log
 TOKENS = (49, 256)  # height and width of the image of token probabilities [px]
-
-
-def recording_name(seed: int, outcome: str) -> str:
-    """Return the file name of an episode; in alphabetical order failures come first, and seeds ascend."""
-    return f"success-{seed:08d}" if outcome == "success" else f"failure-{seed:08d}-{outcome}"
 
 
 class RerunRecorder:
@@ -90,7 +86,7 @@ class RerunRecorder:
         stream.disconnect()
         self._pictured[episode.outcome] += 1
         if self._pictured[episode.outcome] <= self._pictures:
-            save_moving_picture(episode, events, self._folder / f"{name}.webp")
+            save_moving_picture(episode, self._folder / f"{name}.webp")
 
     def _pose(self) -> None:
         if self._world is not None:
@@ -286,8 +282,7 @@ def _curves(what: str, units: Sequence[str]) -> list[rrb.TimeSeriesView]:
 def merge(files: Sequence[Path], target: Path) -> None:
     """Merge recordings into one file, in which the viewer lists them by name.
 
-    Raises:
-        UserError: there are no files, or one of them is no recording.
+    There is a UserError if there are no files, or one of them is no recording.
     """
     if not files:
         raise UserError(f"no recordings to merge into {target}")

@@ -27,11 +27,7 @@ class Stage:
         self._recording: Recorder | None = None
 
     def reset(self, seed: int, recorded: bool = False) -> Observation:
-        """Start the episode of a seed.
-
-        Raises:
-            UserError: it is over at its start.
-        """
+        """Start the episode of a seed; a UserError if it is over at its start."""
         self._now = self.environment.reset(seed)
         if self.environment.done:
             raise UserError(f"the episode of seed {seed} is over at its start: `reset` must draw another one")
@@ -108,7 +104,7 @@ class Worlds:
         return answers
 
 
-class Alone:
+class _Alone:
     """An agent of one world in a single lane."""
 
     def __init__(self, agent: Agent) -> None:
@@ -136,7 +132,7 @@ class Alone:
 
 def in_lanes(agent: Agent | Agents) -> Agents:
     """Return agents in lanes; an agent of one world is in a single one."""
-    return agent if isinstance(agent, Agents) else Alone(agent)
+    return agent if isinstance(agent, Agents) else _Alone(agent)
 
 
 @dataclass
@@ -219,7 +215,7 @@ def _acted(agents: Agents, seen: Mapping[int, Observation], components: int) -> 
     for lane, action in zip(lanes, actions, strict=True):
         found[lane] = action
         if action.shape != (components,) or not np.isfinite(action).all():
-            name = type(agents.agent if isinstance(agents, Alone) else agents).__name__
+            name = type(agents.agent if isinstance(agents, _Alone) else agents).__name__
             found[lane] = UserError(f"{name} must return {components} finite numbers, got {action}")
     return found
 

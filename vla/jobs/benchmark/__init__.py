@@ -19,7 +19,7 @@ from vla.parallel.limits import cores
 log = logging.getLogger(__name__)
 
 BUSY = 0.05  # share of all cores that spoils a figure when other programs use it
-MODULES = dict.fromkeys(("policy", "evaluate", "deploy", "serve"), "acting")  # others are named like their stage
+MODULES = dict.fromkeys(("policy", "evaluate"), "acting")  # others are named like their stage
 
 
 def run(experiment: Experiment) -> dict[str, Measure]:
