@@ -6,14 +6,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from vla.rollouts.collect import COLLECTION_TIME
-
 EPISODES = 30
 TRIED = 37  # seeds 3, 8, 13, … fail
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name not in ("lock", COLLECTION_TIME)}
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "lock"}
 
 
 def lines(folder: Path) -> int:

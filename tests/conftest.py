@@ -57,7 +57,6 @@ def pytest_configure(config: pytest.Config) -> None:
     if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
         folder = os.environ["TORCHINDUCTOR_CACHE_DIR"] = mkdtemp(prefix="compiled-by-tests-")  # workers inherit it
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
-        os.environ["XDG_STATE_HOME"] = folder  # so that no test adds to what the user trusts
     if "PYTEST_XDIST_WORKER" not in os.environ:
         warm.start()
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from vla.reports.comparison import compare_runs, read_runs, remarks, rows_of
+from vla.reports.comparison import compare, read_runs, remarks, rows_of
 from vla.reports.comparison_page import write_comparison
 from vla.reports.evaluation import write_report
 from vla.rollouts.comparison import compare_conditions
@@ -48,11 +49,12 @@ def a_run(
 ) -> Path:
     """A folder as an evaluation leaves it, without pictures and recordings.
 
-    s is a success, d a drop, e an error, and in the dark all are drops unless told. The report has `more` entries.
+    s is a success, d a drop, t a timeout, e an error; in the dark all are drops unless told. The report has `more`
+    entries.
     """
     folder.mkdir(parents=True)
     report, in_the_dark = (
-        a_report(*({"s": "success", "d": "dropped", "e": "error"}[outcome] for outcome in all_of_them))
+        a_report(*({"s": "success", "d": "dropped", "t": "timeout", "e": "error"}[outcome] for outcome in all_of_them))
         for all_of_them in (outcomes, dark or "d" * len(outcomes))
     )
     if light is not None:
@@ -71,5 +73,5 @@ def a_run(
 def compared(folders: list[Path], target: Path) -> Path:
     """The page of `job=report`."""
     runs = read_runs(folders)
-    found, page = compare_runs(runs, 0.02), target / "comparison.html"
+    found, page = compare(combinations(rows_of(runs), 2), 0.02), target / "comparison.html"
     return write_comparison(page, f"{len(runs)} runs", rows_of(runs), found, remarks(runs, found))

@@ -29,7 +29,7 @@ BAD_INPUT = {
     "checkpoint=3": "checkpoint=3 is not a path",
     "checkpoint=x output=2": "output=2 is not a path",
     "job=train checkpoint=x": "job=train takes no checkpoint: resume=RUN continues a run, pretrained=x starts",
-    "resume=last output=nowhere/now": "no run in nowhere was interrupted",
+    "resume=last output=nowhere/now": "resume=last: nothing was trained in nowhere",
     "job=preview task.blocks=4 task.randomize.placement.x=[0.5,0.5]": "no room",
     "job=collect expert=lerobot expert.folder=nowhere": "no LeRobot dataset in nowhere",
     "job=train collect.more=[lessons] collect.folder=store": "lessons",
@@ -38,13 +38,12 @@ BAD_INPUT = {
     "job=deploy deploy=server deploy.host=0.0.0.0": "set the environment variable",
     "checkpoint=x task.hand_size=0.3": "+task.hand_size=VALUE adds it",
     "job=preview expert=metaworld": "expert=metaworld acts in task=metaworld only",
-    "task=metaworld task/goal=lift": "the option chosen for task has no goal",
-    "experiment=standard task=metaworld": "the option chosen for task has no randomize: choose another task",
+    "task=metaworld task/goal=lift": "no option chosen has the group 'task/goal': +task/goal=OPTION adds it",
+    "experiment=standard task=metaworld": "no option chosen has the group 'task/randomize'",
     "job=preview task=gymnasium": "task.package",
     "task.image_size.height=64": "height",
     "--experimental-rerun x.pickle": "--experimental-rerun runs whatever a file says",
     "--exp=x.pickle": "--experimental-rerun runs whatever a file says",
-    "job=train collect.folder=s collect.more=[a,./s]": "name the same store, ",
     "-m seed=range(0,0)": "the sweep has no cells: one of its ranges or choices is empty",
     "-m trainer=ddp trainer.accelerator=cpu trainer.devices=2 seed=0": "add trainer.devices=1, or hydra/launcher=sub",
     "-m experiment=ablation,recipe": "experiment=ablation is a grid of its own: name no other one beside it",
@@ -90,7 +89,7 @@ NONSENSE = {
         evaluate.episodes=0 evaluate.seed=3 policy.precision=16
     """,
     "benchmark": """
-        benchmark.names=[] benchmark.names=[training] benchmark.precisions=[fp16] benchmark.rounds=0
+        benchmark.names=[] benchmark.names=[training] benchmark.precisions=[fp16] benchmark.compile=[]
     """,
     "inspect": """
         inspect.stores=[] inspect.folder=

@@ -48,7 +48,7 @@ def test_the_card_tells_what_is_there(tmp_path: Path, figures: list[Figure]) -> 
     numbers = [*low, *high]
     assert text.startswith("# store\n") and f"point | {min(numbers):.4g} … {max(numbers):.4g}" in text
     assert "gripper | 1 | 0 | 1 | 1 | 0" in text and "uint8 16 x 16 x 3 per step" in text
-    assert '"size": 1.0' in text and "collect.episodes=4" in text
+    assert '"size": 1.0' in text
     found = {axes.get_title(): axes for axes in figures[0].axes}
     assert bars(found["outcomes of all seeds"]) == [4, 1]
     assert {" 4  success", " 1  timeout"} <= texts(found["outcomes of all seeds"])

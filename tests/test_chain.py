@@ -20,9 +20,8 @@ from vla.deploy.settings import Topics
 from vla.reports.evaluation import summary, write_report
 from vla.reports.run_page import write_page
 from vla.rollouts.evaluate import play_episode
-from vla.rollouts.moving_picture import read_moving_pictures
-from vla.rollouts.recorder import RerunRecorder, recording_name
-from vla.rollouts.results import Report, Result
+from vla.rollouts.recorder import RerunRecorder
+from vla.rollouts.results import Report, Result, recording_name
 from vla.rollouts.rollout import replay, rollout
 from vla.rollouts.statistics import bounded_mean_interval, wilson_interval
 from vla.spec import FIRST_SEED, Array, Observation
@@ -127,8 +126,6 @@ def test_the_next_instruction_comes_when_one_is_completed(chain: Tabletop, tmp_p
     columns = chunk.to_record_batch().to_pydict()
     assert columns["step"] == [said.index(each) for each in wanted]
     assert all(each in text for each, [text] in zip(wanted, columns["TextDocument:text"], strict=True))
-    [caption] = read_moving_pictures(tmp_path)
-    assert caption.instruction == "; then ".join(wanted)
 
 
 def test_a_chain_ends_where_one_instruction_fails_and_its_outcome_is_about_that_one(chain: Tabletop) -> None:
@@ -180,11 +177,11 @@ def test_a_report_tells_how_many_were_completed_in_a_row(tmp_path: Path) -> None
     report = in_a_row(4, 4, 2, 0)
     assert report.in_a_row == {"1/4": 3, "2/4": 3, "3/4": 2, "4/4": 2}
     lines = str(report).splitlines()
-    assert "2/4 completed in 3/4 (75.0 %, 95 % CI 30.1-95.4)" in lines
+    assert "2/4 3/4 (75.0 %, 95 % CI 30.1-95.4)" in lines
     assert any(line.startswith("completed in a row on average 2.50 (95 % CI ") for line in lines)
     told = summary(report)
-    assert told["in_a_row"]["3/4"]["episodes"] == 2
-    assert told["mean_in_a_row"]["ci_low"] < told["mean_in_a_row"]["number"] == 2.5 < told["mean_in_a_row"]["ci_high"]
+    assert told["in_a_row"]["3/4"]["count"] == 2
+    assert told["mean_in_a_row"]["ci_low"] < told["mean_in_a_row"]["mean"] == 2.5 < told["mean_in_a_row"]["ci_high"]
     write_report(report, tmp_path / "report.json", None, {})
     page = write_page(tmp_path).read_text()
     assert "Instructions completed in a row" in page and "on average 2.50" in page and ">3/4</td>" in page
@@ -193,7 +190,7 @@ def test_a_report_tells_how_many_were_completed_in_a_row(tmp_path: Path) -> None
 
 def test_episodes_of_one_instruction_have_no_such_rates() -> None:
     report = Report((Result(FIRST_SEED, "success"),))
-    assert report.mean_in_a_row is None and "in_a_row" not in summary(report) and "completed" not in str(report)
+    assert report.mean_in_a_row is None and not summary(report)["in_a_row"] and "completed" not in str(report)
 
 
 def test_the_interval_of_a_bounded_mean() -> None:

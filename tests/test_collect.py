@@ -25,13 +25,11 @@ from vla.data.index import NOT_NEEDED
 from vla.data.verification import verify_store
 from vla.parallel.pool import Cluster
 from vla.rollouts.collect import (
-    COLLECTION_TIME,
     MAX_FAILURES,
     NOT_REPEATABLE,
     DemonstrationWorker,
     Summary,
     collect,
-    collection_time,
 )
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, rollout
 from vla.spec import FIRST_SEED, Episode, Observation
@@ -134,28 +132,6 @@ def test_shares_depend_neither_on_workers_nor_on_interruptions(tmp_path: Path) -
     for episodes in (2, 7, 20):
         in_turn(tmp_path / "grown", episodes)
     assert content(tmp_path / "parallel") == content(tmp_path / "grown") == content(tmp_path / "whole")
-
-
-def test_how_long_it_took_is_shared_out_among_the_episodes_and_may_be_unknown(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    gather(tmp_path, episodes=4)
-    (tmp_path / COLLECTION_TIME).write_text("1000.0\n")
-    gather(tmp_path, episodes=8)
-    store = EpisodeStore(tmp_path)
-    whole = collection_time(store, 8)
-    assert whole is not None and whole >= 1000
-    assert collection_time(store, 2) == pytest.approx(whole / 4)
-    file = tmp_path / COLLECTION_TIME
-    file.unlink()
-    assert collection_time(store, 8) is None
-    for damage in ("", "soon", "nan", "1e400", "1e300", "-1", "[1]", "1" * 10**6):
-        file.write_text(damage)
-        assert collection_time(store, 2) is None
-        assert f"the duration of the collection is unknown: {file}" in caplog.text
-        caplog.clear()
-    assert gather(tmp_path, episodes=10).episodes == 10
-    assert collection_time(EpisodeStore(tmp_path), 10) is None and file.read_text() == damage
 
 
 def test_killed_at_random_moments_it_loses_and_doubles_nothing(tmp_path: Path) -> None:

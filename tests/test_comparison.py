@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import fisher_exact, multinomial, quantile_test
 
 from vla.rollouts.comparison import (
+    SUCCESS,
     Comparison,
     Pairs,
     compare_amounts,
@@ -63,12 +64,17 @@ def test_the_test_of_different_episodes_is_fishers() -> None:
 
 
 def test_p_values_are_adjusted_step_by_step() -> None:
-    found = concluded({name: a_comparison(p) for name, p in zip("abcd", (0.01, 0.04, 0.03, 0.005), strict=True)}, 0.02)
+    others = {"grasped": a_comparison(0.5)}  # which are adjusted among each other
+    cases = {
+        name: {SUCCESS: a_comparison(p), **others} for name, p in zip("abcd", (0.01, 0.04, 0.03, 0.005), strict=True)
+    }
+    found = concluded(cases, 0.02)
     assert list(found) == list("abcd")
-    assert [each.p_holm for each in found.values()] == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert [each[SUCCESS].p_holm for each in found.values()] == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert {each["grasped"].p_holm for each in found.values()} == {1.0}
     # Pairs that never differ could not have told anything.
-    found = concluded({"a": a_comparison(0.03), "b": a_comparison(1.0, 0.0, differ=0)}, 0.02)
-    assert [each.p_holm for each in found.values()] == pytest.approx([0.03, 1.0])
+    found = concluded({"a": {SUCCESS: a_comparison(0.03)}, "b": {SUCCESS: a_comparison(1.0, 0.0, differ=0)}}, 0.02)
+    assert [each[SUCCESS].p_holm for each in found.values()] == pytest.approx([0.03, 1.0])
     assert concluded({}, 0.02) == {}
 
 

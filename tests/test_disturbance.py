@@ -6,15 +6,12 @@ import dataclasses
 import json
 import math
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 import pytest
 from conftest import make_tabletop
 
-from vla.rollouts.moving_picture import read_moving_pictures
-from vla.rollouts.recorder import RerunRecorder
 from vla.rollouts.rollout import replay, rollout
 from vla.tasks.tabletop.compiled_scene import Kind
 from vla.tasks.tabletop.environment import Tabletop
@@ -175,10 +172,3 @@ def test_impossible_instructions_stay_possible_to_follow() -> None:
         played(environment, seed)
         assert len(environment.events) == 1
     environment.close()
-
-
-def test_moving_pictures_tell_when(world: Tabletop, tmp_path: Path) -> None:
-    only(world, kinds=["move_target"])
-    rollout(world, Waypoint(world.spec), 1, RerunRecorder(tmp_path, pictures=1))
-    [caption] = read_moving_pictures(tmp_path)
-    assert [*caption.events] == world.events and len(caption.events) == 1

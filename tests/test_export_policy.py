@@ -41,7 +41,7 @@ pytestmark = pytest.mark.usefixtures("faster_exports")
 )
 def test_the_programs_act_like_the_policy_for_any_instruction(make: Callable[[], Model], tmp_path: Path) -> None:
     policy = as_policy(make())
-    folder = ProgramExporter(tmp_path / "program").export_policy(policy)
+    folder = ProgramExporter(tmp_path / "program").export(policy)
     report = json.loads((folder / "program.json").read_text())
     assert report["spec"] == SPEC.to_dict() and report["act"]["difference"] < 1e-3
     encoders = {"encode.onnx"} if "encode" in report else set()
@@ -75,12 +75,12 @@ def test_a_program_that_differs_is_not_written(
 
     monkeypatch.setattr("vla.deploy.onnx_policy.capture", captured)
     with pytest.raises(ValueError, match=r"\.onnx differs from the model"):
-        ProgramExporter(tmp_path / "program").export_policy(as_policy(make_rt1(layers=1)))
+        ProgramExporter(tmp_path / "program").export(as_policy(make_rt1(layers=1)))
     assert not list(tmp_path.iterdir())
 
 
 def test_an_existing_folder_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "program").mkdir()
     with pytest.raises(ValueError, match=r"exists already: choose another export\.folder"):
-        ProgramExporter(tmp_path / "program").export_policy(as_policy(make_bc()))
+        ProgramExporter(tmp_path / "program").export(as_policy(make_bc()))
     assert [path.name for path in tmp_path.iterdir()] == ["program"]

@@ -101,7 +101,6 @@ def test_a_collection_grows_to_the_same_bytes(tmp_path: Path, codec: Codec) -> N
         for episodes in steps:
             store = EpisodeStore.create_or_open(tmp_path / folder, ARM_SPEC, CONFIG, codec)
             collect(store, make_arm, make_expert, episodes, Cluster(workers, "beside"), seed=0)
-        (tmp_path / folder / "seconds.txt").unlink()
     assert content(tmp_path / "grown") == content(tmp_path / "whole")
     assert len(EpisodeStore(tmp_path / "grown").episodes) == 6
 

@@ -138,7 +138,7 @@ def test_what_the_command_line_names_is_trusted_and_what_a_file_names_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(packages.TRUSTED, "")
-    with pytest.raises(ValueError, match=r"task uses 'toy_gym', which is not trusted: add trust=\[toy_gym\]"):
+    with pytest.raises(ValueError, match=r"task names toy_gym, which is not trusted: add trust=\[toy_gym\]"):
         build(node(), "task")
     packages.trust([], [], ["toy_gym", "???"])
     build(node(), "task").close()
@@ -149,9 +149,9 @@ def test_what_the_command_line_names_is_trusted_and_what_a_file_names_is_not(
             packages.trust([], [], [name])
     packages.trust([], [])
     file = save_policy(tmp_path / "policy", plain(composed(*VALUES)))
-    with pytest.raises(ValueError, match=r"policy uses 'toy_gym', which is not trusted: add trust=\[toy_gym\]"):
+    with pytest.raises(ValueError, match=r"policy names toy_gym, which is not trusted: add trust=\[toy_gym\]"):
         adopt(composed(f"checkpoint={file}"), [])
-    with pytest.raises(ValueError, match="'toy_gym', which is not trusted"):
+    with pytest.raises(ValueError, match="toy_gym, which is not trusted"):
         build(node(), "task")
 
 

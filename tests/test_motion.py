@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from math import log
 from pathlib import Path
@@ -13,7 +12,7 @@ import toy
 
 from vla.reports.evaluation import write_report
 from vla.reports.run_page import write_page
-from vla.rollouts.comparison import compare_conditions, compare_secondary_metrics
+from vla.rollouts.comparison import SUCCESS, compare_conditions
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.motion import Motion, log_dimensionless_jerk, path_length
 from vla.rollouts.results import Report
@@ -71,29 +70,21 @@ def test_conditions_are_compared_in_motion_and_milestones(tmp_path: Path) -> Non
         )
     )
     reports = {"seen": first, "slow": slow}
-    secondary, compared = compare_secondary_metrics(reports), compare_conditions(reports, 0.02)
-    found = secondary["slow"]
-    assert list(found) == ["time_s", "path_m", "jerk", "near"] and compared["slow"].verdict == "open"
+    compared = compare_conditions(reports, 0.02)
+    found = compared["slow"]
     assert {name: each.verdict for name, each in found.items()} == {
-        **{"time_s": "more", "near": "less"},
+        **{SUCCESS: "open", "time_s": "more", "near": "less"},
         **{"path_m": "open", "jerk": "open"},
     }
     assert (found["time_s"].difference, found["time_s"].episodes) == (pytest.approx(0.5), first.successes)
     stayed = Report(tuple(replace(each, task="stay", milestones=()) for each in first.results))
-    assert "near" not in compare_secondary_metrics({"seen": first, "empty": stayed})["empty"]  # another task
+    assert "near" not in compare_conditions({"seen": first, "empty": stayed}, 0.02)["empty"]  # another task
     # Pairs that never differ cannot find anything: of four comparisons two count.
     assert found["near"].p_holm == pytest.approx(2 * found["near"].p)
-    write_report(first, tmp_path / "report.json", None, {}, None, {"slow": slow}, compared, secondary)
+    write_report(first, tmp_path / "report.json", None, {}, None, {"slow": slow}, compared)
     read = read_run(tmp_path)
     assert [each.motion for each in read.reports["slow"].results] == [each.motion for each in slow.results]
     assert read.report is not None and read.reports["seen"].medians == first.medians
-    assert read.report.conditions["slow"].secondary == found
+    assert read.report.conditions["slow"].compared == found
     page = write_page(tmp_path).read_text()
     assert "+0.5 * (" in page and "log jerk" in page and "-100.0 * (" in page
-    old = json.loads((tmp_path / "report.json").read_text())
-    for part in (old, old["conditions"]["slow"]):
-        del part["motion"]
-    for name in ("secondary", "reached", "motions"):
-        del old["conditions"]["slow"][name]
-    (tmp_path / "report.json").write_text(json.dumps(old))
-    assert read_run(tmp_path).reports["slow"].results[0].motion is None

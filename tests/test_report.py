@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from toy_recordable import make_environment
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.factors import factors
 from vla.reports.observations import draws_table, save_contact_sheet
+from vla.reports.pictures import save, svgs
 from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import FIRST_SEED
@@ -71,6 +73,14 @@ def test_rates_share_a_scale_that_shows_their_intervals(tmp_path: Path, figures:
     lowest = min(axes.dataLim.y0 for axes in panels)
     assert len(panels) == 2 and 0.9 < lowest < 0.96  # 20 of 500 in one half, whose interval begins at 94 %
     assert {axes.get_ylim() for axes in panels} == {(0.9, 1.0)}
+
+
+def test_texts_of_a_page_are_left_to_the_fonts_of_the_browser(tmp_path: Path) -> None:
+    chinese = "拿起红色方块"
+    assert f">{chinese}<" in svgs({"": lambda axes: axes.text(0, 0, chinese)})[""]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        save(tmp_path / "title.png", {chinese: lambda axes: axes.axis("off")}, 1)
 
 
 def test_a_contact_sheet_shows_the_observations(tmp_path: Path, figures: list[Figure]) -> None:

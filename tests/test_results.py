@@ -12,7 +12,7 @@ import pytest
 from finished_runs import CONFIG, a_run, compared
 
 from vla.runs.files import Change, Training
-from vla.runs.folder import read_run, save_training, wall_time
+from vla.runs.folder import read_run, save_training
 
 BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
 
@@ -24,11 +24,10 @@ def changed(**values: Any) -> Callable[[str], str]:
 
 def test_what_was_written_is_read(tmp_path: Path) -> None:
     folder = a_run(tmp_path / "run", "sd")
-    save_training(folder, Training(12, 40, 3.0, "done", 2.0))
+    save_training(folder, Training(12, 40, 3.0, "done"))
     run = read_run(folder)
-    assert run.training == Training(12, 40, 3.0, "done", 2.0)
+    assert run.training == Training(12, 40, 3.0, "done")
     assert (run.policy, run.tasks) == ("BC", [])
-    assert wall_time(folder / "policy", 1.0) == 6.0
     assert run.changes == [Change("model.width", 16, 32)] and run.config["task"] == CONFIG["task"]
     assert run.report is not None and run.reports["seen"].successes == 1
     assert [result.outcome for result in run.reports["seen"].results] == ["success", "dropped"]
@@ -89,16 +88,3 @@ def test_what_a_killed_process_left_half_and_points_that_are_no_number_are_not_d
     assert "<svg" in compared([run.folder], tmp_path).read_text()
     (run.folder / "metrics.csv").write_text("")
     assert read_run(run.folder).metrics == {}
-
-
-def test_a_damaged_description_of_the_training_costs_no_evaluation(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    folder = a_run(tmp_path / "run")
-    save_training(folder, Training(12, 40, 3.0, "done", 2.0))
-    for name in ("metrics.csv", "report.json", "config.yaml"):
-        (folder / name).write_text("[1]")
-    assert wall_time(folder / "policy", 1.0) == 6.0
-    (folder / "training.json").write_text('{"seconds": NaN}')
-    assert wall_time(folder / "policy", 1.0) is None
-    assert f"the wall time is unknown: {folder / 'training.json'} is damaged" in caplog.text

@@ -17,8 +17,7 @@ from vla.config.adopt import resume
 from vla.config.experiment import plain
 from vla.reports.evaluation import write_report
 from vla.rollouts.results import Report, Result
-from vla.runs.folder import save_config
-from vla.runs.resume import FOUND, TrainingProgress, cached_success, interrupted_run, training_progress
+from vla.runs.resume import cached_success, newest_run, training_progress
 
 OF_TRAINER = ("trainer.max_steps=9", "trainer.precision=bf16")
 
@@ -33,40 +32,13 @@ def leave(run: Path, config: dict[str, Any], finished: bool, chosen: bool = Fals
         save_policy(run / "policy", config)
 
 
-@pytest.fixture(autouse=True)
-def nothing_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(FOUND, "")
-
-
-def test_the_newest_run_that_did_not_end_is_found(tmp_path: Path) -> None:
-    evaluated, trained = plain(composed()), plain(composed("job=train"))
-    leave(tmp_path / "whole", trained, finished=True, chosen=True)
-    with pytest.raises(ValueError, match="no run in"):
-        interrupted_run(tmp_path)
-    leave(tmp_path / "unreported", evaluated, finished=True, chosen=True)
-    assert interrupted_run(tmp_path) == tmp_path / "unreported"
-    leave(tmp_path / "unfinished", trained, finished=False, chosen=True)
-    assert interrupted_run(tmp_path) == tmp_path / "unfinished"
-
-
-def test_a_run_that_was_extended_after_its_report_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run, rounds = tmp_path / "run", tmp_path / "rounds"
-    leave(run, plain(composed()), finished=True, chosen=True)
-    leave(rounds / "round_0", plain(composed("job=train")), finished=True, chosen=True)
-    save_config(rounds, plain(composed("job=improve")), [])
-    for folder, last in ((run, run), (rounds, rounds / "round_0")):
-        monkeypatch.setenv(FOUND, "")
-        write_report(Report((Result(0, "success"),)), folder / "report.json", None, {})
-        later = time.time() + 10
-        os.utime(last / "checkpoints/last.ckpt", (later, later))
-        assert interrupted_run(tmp_path) == folder
-        os.utime(folder / "report.json", (later, later))
-
-
-def test_several_processes_are_told_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "2")
-    with pytest.raises(ValueError, match="each of several processes would search for itself: name the run, resume=RUN"):
-        interrupted_run(tmp_path)
+def test_the_run_that_was_trained_last_is_the_newest(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="resume=last: nothing was trained in"):
+        newest_run(tmp_path)
+    for number, name in enumerate(("one", "rounds/round_1", "another")):
+        leave(tmp_path / name, plain(composed("job=train")), finished=False)
+        os.utime(tmp_path / name / "checkpoints/last.ckpt", (number % 2, number % 2))
+    assert newest_run(tmp_path) == tmp_path / "rounds"
 
 
 def test_a_training_without_rounds_is_not_resumed_as_one(tmp_path: Path) -> None:
@@ -99,16 +71,16 @@ def test_a_run_is_resumed_with_its_config_in_its_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("finished", "chosen"), [(False, False), (False, True), (True, False), (True, True)])
 def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: bool) -> None:
     config = plain(composed())
-    assert training_progress(tmp_path, config) == TrainingProgress()
+    assert training_progress(tmp_path, config) == (None, None)
     leave(tmp_path, config, finished, chosen)
     last = tmp_path / "checkpoints/last.ckpt"
     whole = finished and chosen
-    expected = TrainingProgress(chosen=tmp_path / "policy") if whole else TrainingProgress(resume_from=last)
+    expected = (None, tmp_path / "policy") if whole else (last, None)
     for name in ("metrics.csv", "report.json", "config.yaml"):
         (tmp_path / name).write_text("[1]")  # damaged, and not needed
     assert training_progress(tmp_path, plain(composed("cluster.workers=1"))) == expected
     assert training_progress(tmp_path, plain(composed("trainer.max_steps=1"))) == expected
-    assert training_progress(tmp_path, plain(composed("trainer.max_steps=99999"))) == TrainingProgress(resume_from=last)
+    assert training_progress(tmp_path, plain(composed("trainer.max_steps=99999"))) == (last, None)
     for other in ("model.width=17", "+trainer.sync_batchnorm=true", "+trainer.gradient_clip_algorithm=value"):
         key = other.strip("+").partition("=")[0]
         with pytest.raises(ValueError, match=rf"differs in {re.escape(key)}: choose another output=DIR"):

@@ -33,7 +33,7 @@ from vla import jobs
 from vla.data.episodes import EpisodeStore
 from vla.io.array_messages import pack
 from vla.models.policy_folder import read_policy
-from vla.rollouts.recorder import recording_name
+from vla.rollouts.results import recording_name
 from vla.tasks.rendering.fast import Fast
 from vla.tasks.rendering.reference import Reference
 
@@ -52,7 +52,6 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     assert (report["experiment"], report["model"]) == ("none", "bc")
     assert {result["task"] for result in report["per_episode"]} == {"pick_place"}
     training = json.loads((home / "run/training.json").read_text())
-    assert report["wall_time_s"] > training["collection_s"] + training["seconds"] > training["collection_s"] > 0
     assert report["episodes"] == 2 and report["errors"] == 0
     assert report["versions"]["mujoco"] == mujoco.__version__
     assert report["config"]["collect"]["episodes"] == 12
@@ -87,7 +86,7 @@ def test_a_checkpoint_brings_its_task_and_model_and_takes_harder_scenes(home: Pa
     report = json.loads((home / "again/report.json").read_text())
     assert report["config"]["task"]["image_size"] == [32, 32]
     assert "purple" in report["config"]["task"]["randomize"]["colour"]["names"]
-    assert report["model"] == "bc" and report["wall_time_s"] > 0
+    assert report["model"] == "bc"
     refused = here(home, *arguments, "model=rt1_tiny", ok=False)
     assert refused.stderr.count("\n") == 1 and "model=rt1_tiny" in refused.stderr
 
@@ -198,7 +197,7 @@ def test_an_evaluation_ends_when_what_it_is_asked_is_decided(home: Path) -> None
     assert report["anytime"] and blind["anytime"] and 1 < blind["episodes"] < report["episodes"] < 40
     assert report["successes"] == 0 and report["ci_high"] < 0.5  # hardly trained
     assert report["statements"] == ["success is below the bar of 50 %"]
-    assert blind["comparison"]["verdict"] == "not worse by 90 points"
+    assert blind["compared"]["success"]["verdict"] == "not worse by 90 points"
     assert report["statements"][0] in done.stdout and "anytime-valid 95 % CI" in done.stdout.strip().splitlines()[-1]
     page = (home / "beside/report.html").read_text()
     assert report["statements"][0] in page and "anytime-valid" in page
@@ -400,8 +399,8 @@ def test_resuming_refuses_a_changed_identity_and_archives_the_evaluation(home: P
     done = here(home, "job=train", "resume=longer", "output=longer", "trainer.max_steps=6")
     assert "trained 6 steps" in done.stdout
     # Its evaluation was of the policy before: nothing of it is said of this one.
-    assert (home / "longer/evaluation_4/report.json").read_bytes() == (home / "run/report.json").read_bytes()
-    assert not list((home / "longer").glob("report.json")) and not list((home / "longer").glob("*.rrd"))
+    assert (home / "longer/report_4.json").read_bytes() == (home / "run/report.json").read_bytes()
+    assert not list((home / "longer").glob("report.json")) and not (home / "longer/rollouts.rrd").exists()
     page = (home / "longer/report.html").read_text()
     assert "6 steps" in page and "95 % CI" not in page
 
@@ -427,8 +426,6 @@ def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path
     shutil.rmtree(tmp_path / "theirs")  # which going on does not need
     done = here(home, "resume=tuned", "output=tuned", "trainer.max_steps=2")
     assert "trained 2 steps" in done.stdout
-    done = here(home, *arguments, "learner.lr=1e-12", "trainer.max_steps=1", "output=tuned")
-    assert "training is already finished" in done.stdout
 
 
 def test_a_checkpoint_of_other_cameras_is_refused(home: Path) -> None:

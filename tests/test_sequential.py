@@ -20,7 +20,6 @@ from vla.rollouts.sequential import (
     anytime_difference,
     anytime_interval,
     anytime_p,
-    decided_after,
     excludes,
     is_decided,
     log_capital,
@@ -96,15 +95,6 @@ def test_policies_that_are_equal_or_a_margin_apart_are_rarely_called_otherwise(l
                 wrong += not low <= won - lost <= high
                 break
     assert wrong <= 0.05 * SIMULATIONS
-
-
-def test_a_comparison_is_decided_after_the_first_episode_or_round_that_tells() -> None:
-    outcomes = [(True, True), (False, True)] * 20
-    stop = decided_after(outcomes, 0.02)
-    assert stop is not None and stop % 2 == 0 and is_decided(0, stop // 2, stop, 0.02)
-    assert not is_decided(0, stop // 2 - 1, stop - 2, 0.02) and decided_after(outcomes[: stop - 1], 0.02) is None
-    assert decided_after(outcomes, 0.02, turns=stop + 2) == stop + 2
-    assert decided_after([(True, False), (False, True)] * 20, 0.02) is None
 
 
 def test_an_evaluation_stops_when_it_is_clear_whatever_the_number_of_workers() -> None:

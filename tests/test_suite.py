@@ -12,7 +12,7 @@ from PIL import Image
 from rich.console import Console
 
 from vla.reports.result_tables import conditions_table, plot_conditions
-from vla.rollouts.comparison import Comparison, compare_conditions
+from vla.rollouts.comparison import SUCCESS, Comparison, compare_conditions
 from vla.rollouts.results import Report, Result
 from vla.spec import FIRST_SEED
 
@@ -24,7 +24,7 @@ def a_report(outcomes: str) -> Report:
 
 
 def compared(first: str, second: str) -> Comparison:
-    return compare_conditions({"seen": a_report(first), "dark": a_report(second)}, 0.02)["dark"]
+    return compare_conditions({"seen": a_report(first), "dark": a_report(second)}, 0.02)["dark"][SUCCESS]
 
 
 def p_value(first: str, second: str) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 import re
@@ -13,16 +12,16 @@ from figures import panels, points, spans, texts
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from vla.reports.comparison import compare_rows
+from vla.reports.comparison import Compared, compare
 from vla.reports.comparison_page import results_table
 from vla.reports.evaluation import write_report
 from vla.reports.sweep import tabulate
 from vla.reports.tables import Table
-from vla.rollouts.comparison import compare_samples
+from vla.rollouts.comparison import SUCCESS, compare_samples
 from vla.rollouts.results import Report, Result
 from vla.rollouts.sequential import anytime_interval
 from vla.rollouts.statistics import pooled_interval
-from vla.runs.sweep import read_rows
+from vla.runs.sweep import SweepRow, read_rows
 
 
 def cell(
@@ -55,6 +54,11 @@ def printed(table: Table) -> str:
     return console.export_text()
 
 
+def compare_rows(rows: list[SweepRow]) -> Compared:
+    """Every row with the first one."""
+    return compare(((rows[0], other) for other in rows[1:]), 0.02)
+
+
 def test_seeds_are_put_together_and_the_rest_is_told_apart(tmp_path: Path, figures: list[Figure]) -> None:
     for number, (model, seed, successes) in enumerate([("bc", 0, 9), ("bc", 1, 7), ("rt1", 0, 10), ("rt1", 1, 8)]):
         cell(tmp_path, number, ["trainer.max_steps=5", f"model={model}", f"seed={seed}"], successes, 9.0 - 7 * seed)
@@ -70,14 +74,6 @@ def test_seeds_are_put_together_and_the_rest_is_told_apart(tmp_path: Path, figur
     assert f"| bc | 80.0 ({low:.1f}-{high:.1f}) |" in lines[2] and lines[2].endswith(
         "| 90.0, 70.0 | 2.00 | 2.0 | - | - |"
     )
-    rows = list(csv.DictReader((tmp_path / "sweep.csv").open()))
-    assert [(row["model"], row["condition"]) for row in rows] == [
-        ("bc", "seen"),
-        ("bc", "dark"),
-        ("rt1", "seen"),
-        ("rt1", "dark"),
-    ]
-    assert float(rows[0]["success"]) == pytest.approx(0.8) and rows[0]["cells"] == "2"
     (seen,), (dark,) = (panels(figures[0], title) for title in ("seen", "dark"))
     assert points(seen) == [(0.8, 0.0), (0.9, 1.0)] and points(dark) == [(0.2, 0.0), (0.2, 1.0)]
     assert spans(seen)[0] == (round(low / 100, 3), round(high / 100, 3))
@@ -116,7 +112,6 @@ def test_agents_without_a_model_are_rows_too(tmp_path: Path) -> None:
     write_report(Report((Result(0, "success"),)), tmp_path / "1/report.json", None, {})
     tabulate(tmp_path)
     assert "| expert | 100.0 (20.7-100.0) | - | - | - | - | - |\n" in (tmp_path / "sweep.md").read_text()
-    assert "expert,seen,1.0" in (tmp_path / "sweep.csv").read_text()
 
 
 def test_a_condition_that_not_every_cell_played_is_left_open(tmp_path: Path) -> None:
@@ -133,7 +128,7 @@ def test_rows_are_compared_with_the_first_on_the_same_scenes(tmp_path: Path) -> 
     for number, (model, successes) in enumerate([("bc", 10), ("rt1", 3), ("act", 10)]):
         cell(tmp_path, number, [f"model={model}"], successes)
     rows = tabulate(tmp_path)
-    compared = {(each.other, each.condition): each.found for each in compare_rows(rows, 0.02)}
+    compared = {(name, condition): each[SUCCESS] for (name, _, condition), each in compare_rows(rows).items()}
     assert {*compared} == {(model, condition) for model in ("rt1", "act") for condition in ("seen", "dark")}
     worse = compared["rt1", "seen"]
     assert (worse.only_first, worse.only_second, worse.episodes, worse.verdict) == (7, 0, 10, "worse")
@@ -153,7 +148,7 @@ def test_a_condition_that_repeats_the_training_condition_is_no_further_compariso
             report = json.loads((tmp_path / f"{number}/report.json").read_text())
             report["config"] = {"task": {"light": light}, "evaluate": {"conditions": {"dark": {"light": 0}}}}
             (tmp_path / f"{number}/report.json").write_text(json.dumps(report))
-        assert [each.condition for each in compare_rows(tabulate(tmp_path), 0.02)] == expected
+        assert [condition for _, _, condition in compare_rows(tabulate(tmp_path))] == expected
 
 
 def test_single_trainings_are_compared_in_the_course_of_episodes(tmp_path: Path) -> None:
@@ -163,8 +158,8 @@ def test_single_trainings_are_compared_in_the_course_of_episodes(tmp_path: Path)
         (folder / ".hydra/overrides.yaml").write_text(f"- model={['bc', 'act'][number]}\n")
         results = (Result(seed, "success", "lift", milestones=tuple(milestones)) for seed in range(8))
         write_report(Report(tuple(results)), folder / "report.json", None, {})
-    (compared,) = compare_rows(tabulate(tmp_path), 0.02)
-    assert compared.found.verdict == "open" and compared.secondary["grasped"].difference == -1
+    (compared,) = compare_rows(tabulate(tmp_path)).values()
+    assert compared[SUCCESS].verdict == "open" and compared["grasped"].difference == -1
     page = (tmp_path / "sweep.html").read_text()
     assert "Differences in secondary metrics" in page and "-100.0 * (" in page
 
@@ -172,11 +167,11 @@ def test_single_trainings_are_compared_in_the_course_of_episodes(tmp_path: Path)
 def test_several_trainings_count_as_fewer_episodes_in_a_comparison(tmp_path: Path) -> None:
     for number, (model, successes) in enumerate([("bc", 9), ("bc", 9), ("rt1", 1), ("rt1", 9)]):
         cell(tmp_path, number, [f"model={model}", f"seed={number % 2}"], successes)
-    seen, _ = compare_rows(tabulate(tmp_path), 0.02)
-    assert seen.found.difference == pytest.approx(-0.4) and (seen.found.episodes, seen.found.only_first) == (40, None)
+    seen, _ = (each[SUCCESS] for each in compare_rows(tabulate(tmp_path)).values())
+    assert seen.difference == pytest.approx(-0.4) and (seen.episodes, seen.only_first) == (40, None)
     independent = compare_samples(18, 20, 10, 20)
-    assert independent.p < 0.05 < seen.found.p and seen.found.ci_low < independent.ci_low  # the trainings of rt1 differ
-    assert seen.found.verdict == "open"
+    assert independent.p < 0.05 < seen.p and seen.ci_low < independent.ci_low  # the trainings of rt1 differ
+    assert seen.verdict == "open"
 
 
 def test_several_trainings_are_compared_only_if_all_their_scenes_are_the_same(tmp_path: Path) -> None:
@@ -186,7 +181,7 @@ def test_several_trainings_are_compared_only_if_all_their_scenes_are_the_same(tm
         for result in report["per_episode"]:
             result["draws"] = {"blocks": 2 if result["seed"] < 3 or level == "default" else 3}
         (tmp_path / f"{number}/report.json").write_text(json.dumps(report))
-    assert [each.condition for each in compare_rows(tabulate(tmp_path), 0.02)] == ["dark"]
+    assert [condition for _, _, condition in compare_rows(tabulate(tmp_path))] == ["dark"]
 
 
 def test_a_row_that_stopped_when_it_was_clear_has_its_anytime_valid_interval(tmp_path: Path) -> None:
@@ -205,7 +200,7 @@ def test_rows_of_other_worlds_are_not_compared(tmp_path: Path) -> None:
             result["draws"] = {"light": number}
         report["config"] = {"task": {"randomize": level}}
         (tmp_path / f"{number}/report.json").write_text(json.dumps(report))
-    assert compare_rows(tabulate(tmp_path), 0.02) == []
+    assert not compare_rows(tabulate(tmp_path))
     assert "Differences in success" not in (tmp_path / "sweep.html").read_text()
 
 

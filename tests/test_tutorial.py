@@ -37,4 +37,4 @@ def test_the_tutorial_ends_with_a_policy_for_its_own_goal(tmp_path: Path) -> Non
     assert report["config"]["task"]["goal"]["_target_"].endswith(".LeftOf")
     assert {result["task"] for result in report["per_episode"]} == {"left_of"}
     levels = json.loads((tmp_path / "outputs/runs/left_of_levels/report.json").read_text(encoding="utf-8"))
-    assert levels["conditions"]["wide"]["comparison"]
+    assert levels["conditions"]["wide"]["compared"]

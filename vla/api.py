@@ -23,7 +23,7 @@ def load_policy(
     """Load a trained policy.
 
     Its folder contains no code, but names classes: of other packages only those are built that are trusted, here or
-    by `VLA_TRUST`. What was trusted in a training of this user is trusted for its policies.
+    by `VLA_TRUST`.
 
     Args:
         checkpoint: the folder of a policy, or of a run that has one, or hub:owner/name@revision.
@@ -37,7 +37,7 @@ def load_policy(
     """
     options = {"device": device, "precision": precision, "compile": False, "lanes": lanes}
     folder = policy_folder(checkpoint)
-    with trusting(trust, folder):
+    with trusting(trust):
         return make_policy({"_target_": "vla.policy.Policy", **options}, folder)
 
 
@@ -61,6 +61,6 @@ def load_environment(
     """
     saved = read_policy(checkpoint)
     task = {"task": saved.config["task"]}
-    with trusting(trust, saved.folder):
+    with trusting(trust):
         require_no_paths(task, ["task"], checkpoint)
         return GymEnvironment(make_environment(with_changes(task["task"], changes or {})), render_mode)

@@ -27,7 +27,7 @@ from vla.config.check import check, devices
 from vla.config.compose import CONF, offer_axes, substitutes, with_variant
 from vla.config.compose import compose as compose_again
 from vla.config.experiment import Experiment
-from vla.config.packages import offer_options, trust, trust_own
+from vla.config.packages import offer_options, trust
 from vla.deploy import ros
 from vla.io.errors import UserError
 from vla.io.printable import printable
@@ -57,8 +57,9 @@ def _described(error: Exception) -> str:
         reason = error.message.splitlines()[0]
         return f"cannot read {error.override}: {reason}; quote special characters, as in 'key=\"value\"'"
     if isinstance(error, ConfigCompositionException):
-        if "No match in the defaults list" in text:
-            return _unmatched(re.split(r"Could not \w+ '", text)[-1].partition("'")[0])
+        if "No match in the defaults list" in text:  # such as task/goal of another task
+            group = re.split(r"Could not \w+ '", text)[-1].partition("'")[0]
+            return f"no option chosen has the group '{group}': +{group}=OPTION adds it; --help lists them"
         if isinstance(error.__cause__, OmegaConfBaseException) and error.__cause__.full_key:
             return _unknown_key(error.__cause__)
     if isinstance(error, OmegaConfBaseException) and error.full_key:
@@ -74,28 +75,14 @@ def _among(name: str, known: Sequence[str]) -> str:
     return suggestion(name, known) or f": there are {', '.join(known)}"
 
 
-def _unmatched(group: str) -> str:
-    """Describe a choice from a group that the chosen options do not have, such as task/goal of another task."""
-    parent, _, name = group.rpartition("/")
-    if not parent:
-        return f"there is no group '{group}'; --help lists them"
-    return (
-        f"the option chosen for {parent} has no {name}: choose another {parent}, or add a new part with "
-        f"+{group}=OPTION; --help lists them"
-    )
-
-
 def _unknown_key(error: OmegaConfBaseException) -> str:
     key = str(error.full_key)
     *path, name = str(error.key).replace("/", ".").split(".")
     parent = OmegaConf.select(error.parent_node, ".".join(path)) if path else error.parent_node
     known = [str(key) for key in parent if key != "hydra"] if isinstance(parent, DictConfig) else []
-    if not known:
-        return f"there is no {key}"
-    among = _among(name, known)
+    among = _among(name, known) if known else ""
     # The task of a checkpoint may have other keys than that of the command.
-    hint = "" if among.startswith(",") and not key.startswith("task.") else f"; +{key}=VALUE adds it"
-    return f"there is no {key}{among}{hint}"
+    return f"there is no {key}{among}" + (f"; +{key}=VALUE adds it" if among[:1] == ":" or key[:5] == "task." else "")
 
 
 def _is_mendable(error: Exception) -> bool:
@@ -170,16 +157,13 @@ def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
     for key in ("resume", "checkpoint", "pretrained", "output"):
         if not isinstance(cfg[key], str | None) or (key == "output" and not cfg[key]):
             raise UserError(f"{key}={cfg[key]} is not a path: give a folder or file; a number is quoted, {key}=\\'3\\'")
-    named = [Path(each) for each in (cfg.resume, cfg.pretrained, cfg.checkpoint) if each is not None]
-    if not named:
+    if cfg.resume is cfg.pretrained is cfg.checkpoint is None:
         return cfg
-    for path in named:
-        trust_own(path)
     from vla.config.adopt import adopt, finetune, resume  # imports PyTorch, as the next one does
-    from vla.runs.resume import interrupted_run
+    from vla.runs.resume import newest_run
 
     if cfg.resume is not None:
-        run = interrupted_run(Path(cfg.output).parent) if cfg.resume == "last" else Path(cfg.resume)
+        run = newest_run(Path(cfg.output).parent) if cfg.resume == "last" else Path(cfg.resume)
         return resume(cfg, run, overrides)
     if cfg.pretrained is not None:
         return finetune(cfg, overrides)

@@ -5,8 +5,7 @@ Tasks, data and models exchange only the types below: they import this module an
 
 from __future__ import annotations
 
-import math
-import re
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
@@ -17,18 +16,13 @@ from annotated_types import Ge, Le, MaxLen, MinLen, Predicate
 
 from vla.io.documents import STRICT, parse_plain
 from vla.io.errors import UserError
-from vla.io.types import Count, Point, Positive, unique
+from vla.io.types import Count, Point, Positive, names_a_file, unique
 
 Array = np.ndarray
 
 IN_DISTRIBUTION = "seen"  # name of the unchanged condition of an evaluation, which a policy is trained for
 FIRST_SEED = 1_000_000  # of evaluation; collection uses smaller seeds only
 LONGEST_INSTRUCTION = 1000  # characters
-
-
-def names_a_file(name: str) -> bool:
-    """usable in a file name"""
-    return re.fullmatch(r"\w[\w.-]*", name) is not None
 
 
 # Limits of a spec that is read from a file.
@@ -109,15 +103,11 @@ class Spec:
         return [self.state.index(name) for name in names]
 
     def require_robot(self, what: str) -> RobotModel:
-        """Return the robot.
-
-        Raises:
-            UserError: there is none; the message says that `what` needs it.
-        """
+        """Return the robot; a UserError says that `what` needs it if there is none."""
         if self.robot is None:
             raise UserError(
-                f"{what} needs a robot, and the spec has none (robot=None): its state is {', '.join(self.state)}; a "
-                "world gives one in its spec, a recording by task.joints"
+                f"{what} needs a robot, and the spec of this world has none (robot=None): a world gives one in its "
+                "spec, a recording by task.joints"
             )
         return self.robot
 
@@ -131,7 +121,7 @@ class Spec:
             )
 
     def random_observation(self, random: np.random.Generator) -> Observation:
-        """Return an observation with random images and state, a fixed instruction and no truth."""
+        """Return an observation of noise, with a fixed instruction and no truth."""
         rgb = {camera: random.integers(256, size=(*self.image_size, 3), dtype=np.uint8) for camera in self.cameras}
         depth = {camera: random.integers(2**16, size=self.image_size, dtype=np.uint16) for camera in self.depth}
         state = random.uniform(-1, 1, len(self.state)).astype(np.float32)
@@ -139,15 +129,12 @@ class Spec:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings, for JSON and for checkpoints loaded with `weights_only=True`."""
-        return _plain(asdict(self))
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self), default=lambda number: number.item()))
+        return plain
 
     @classmethod
     def from_dict(cls, values: Any, name: str = "the spec") -> Spec:
-        """Invert `to_dict` on untrusted values; fields with a default may be missing.
-
-        Raises:
-            UserError: `values` are no spec; the message calls them `name`.
-        """
+        """Invert `to_dict` on untrusted values, which a UserError calls `name` if they are no spec."""
         spec = parse_plain(values, cls, name)
         if problem := next(_contradictions(spec), None):
             raise UserError(f"{name} is damaged or of another kind: {problem}")
@@ -178,21 +165,11 @@ def _fields(spec: Spec) -> dict[str, Any]:
     return {**vars(spec), "robot": "an arm" if spec.robot else None, **robot}
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, (tuple, list)) else value
-
-
 def _contradictions(spec: Spec) -> Iterator[str]:
     """Yield the inconsistencies between fields that are valid on their own."""
-    if len(spec.state_units) != len(spec.state):
-        yield f"state_units has {len(spec.state_units)} components, state {len(spec.state)}"
-    for name in ("units", "low", "high"):
-        if len(getattr(spec, name)) != len(spec.action):
-            yield f"{name} has {len(getattr(spec, name))} components, action {len(spec.action)}"
+    for name, other in (("state_units", "state"), ("units", "action"), ("low", "action"), ("high", "action")):
+        if len(getattr(spec, name)) != len(getattr(spec, other)):
+            yield f"{name} has {len(getattr(spec, name))} components, {other} {len(getattr(spec, other))}"
     for name, low, high in zip(spec.action, spec.low, spec.high, strict=False):
         if not low < high:
             yield f"low of {name} is {low}, not less than high, {high}"
@@ -201,19 +178,15 @@ def _contradictions(spec: Spec) -> Iterator[str]:
             yield f"{name} names {', '.join(unknown)}, which is not among the cameras"
     if not unique([name for name, _ in spec.truth]) or spec.truth_size > 4096:
         yield "truth has a name twice, or more than 4096 numbers"
-    if spec.robot is not None:
-        yield from _contradictions_of_robot(spec.robot, spec)
-
-
-def _contradictions_of_robot(robot: RobotModel, spec: Spec) -> Iterator[str]:
-    if unknown := [name for name in robot.components if name not in spec.state]:
-        yield f"robot names {', '.join(unknown)}, which is not in the state"
-    if len(robot.velocities) not in (0, len(robot.joints)):
-        yield f"robot has {len(robot.velocities)} velocities and {len(robot.joints)} joints"
-    if robot.chain and [len(frame) for frame in robot.chain] != [7] * (len(robot.joints) + 1):
-        yield f"chain is not 7 numbers for each of {len(robot.joints)} joints and the tool"
-    if len(robot.home) not in (0, len(robot.joints)):
-        yield f"home has {len(robot.home)} positions for {len(robot.joints)} joints"
+    if robot := spec.robot:
+        joints = len(robot.joints)
+        if unknown := [name for name in robot.components if name not in spec.state]:
+            yield f"robot names {', '.join(unknown)}, which is not in the state"
+        for name in ("velocities", "home"):
+            if len(getattr(robot, name)) not in (0, joints):
+                yield f"robot has {joints} joints and {len(getattr(robot, name))} numbers in {name}"
+        if robot.chain and [len(frame) for frame in robot.chain] != [7] * (joints + 1):
+            yield f"chain is not 7 numbers for each of {joints} joints and the tool"
 
 
 @dataclass(frozen=True)
@@ -237,11 +210,7 @@ class Observation:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], spec: Spec) -> Observation:
-        """Take an observation of an environment of gymnasium: an image per camera, "state" and "instruction".
-
-        Raises:
-            UserError: one of them is missing.
-        """
+        """Take an observation of gymnasium: an image per camera, "state", "instruction"; a UserError if one lacks."""
         if missing := [name for name in (*spec.cameras, "state", "instruction") if name not in values]:
             raise UserError(f"the observation has {', '.join(map(str, values))}, but lacks {', '.join(missing)}")
         rgb = {camera: values[camera] for camera in spec.cameras}
@@ -286,7 +255,14 @@ class Episode:
 
 
 class Environment(Protocol):
-    """World that an agent acts in."""
+    """World that an agent acts in.
+
+    It may also have
+        tool: (3,) true position of the tool centre point in a fixed frame [m]; reports then tell paths and smoothness,
+        events: (step, description) of what the agent did not cause, such as disturbances; recordings mark them,
+        instructions, completed: number of instructions of the current episode, each given when the one before is
+            completed, and how many are; it succeeds when all are, and fails as soon as one does.
+    """
 
     spec: Spec
     task: str  # name of the task of this episode, such as "pick_place"; reports group by it
@@ -328,26 +304,6 @@ class Multitask(Protocol):
 
 
 @runtime_checkable
-class MultiInstruction(Protocol):
-    """Environment that gives several instructions in an episode, each when the one before is completed.
-
-    It succeeds when all are completed, and fails as soon as one does.
-    """
-
-    instructions: int  # of the current episode
-    completed: int  # so far
-
-
-@runtime_checkable
-class HasTool(Protocol):
-    """Environment that exposes the tool position, so that reports contain path length and smoothness."""
-
-    @property
-    def tool(self) -> Array:
-        """(3,) true position of the tool centre point, or another point of the tool, in a fixed frame [m]."""
-
-
-@runtime_checkable
 class HasScene(Protocol):
     """Environment that a recorder can draw in three dimensions."""
 
@@ -361,23 +317,13 @@ class HasScene(Protocol):
 
 
 @runtime_checkable
-class HasEvents(Protocol):
-    """Environment with events that the agent does not cause, such as disturbances; recordings mark their steps."""
-
-    @property
-    def events(self) -> Sequence[tuple[int, str]]:
-        """Return (step, description) of every event so far; step is the observation just before or just after it."""
-
-
-@runtime_checkable
 class TakesJointTargets(Protocol):
     """Environment whose arm also takes joint targets, independently of control periods, like a robot driver."""
 
     def drive(self, joints: Array, opening: float, seconds: float) -> None:
         """Move towards joint targets (J,) [rad] and a gripper opening 0…1 for `seconds` [s].
 
-        Raises:
-            UserError: physics cannot step for so long.
+        A UserError tells if physics cannot step for so long.
         """
 
     def judge(self) -> None:
@@ -391,7 +337,9 @@ class Agent(Protocol):
     """Source of actions: an expert, a policy, a person.
 
     One that also has `looks`, whether its next action may depend on the images, gets no others rendered: False while a
-    planned chunk is executed and no new instruction discards it; always False for experts that read the truth.
+    planned chunk is executed and no new instruction discards it; always False for experts that read the truth. An
+    expert with `memoryless = True` may also label the states that another agent reaches: its action, or the label in
+    `info["clean"]`, depends on the observation alone.
     """
 
     @property
@@ -416,8 +364,7 @@ class Agents(Protocol):
     def act(self, observations: Sequence[Observation], lanes: Sequence[int], /) -> Array:
         """Return the actions (n, D) float32 to execute now in n lanes, given what each of them sees.
 
-        Raises:
-            UserError: an observation does not fit; no lane has acted then.
+        A UserError tells that an observation does not fit; no lane has acted then.
         """
 
     def about(self, lane: int) -> dict[str, Any]:
@@ -425,13 +372,6 @@ class Agents(Protocol):
 
     def looking(self, lane: int) -> bool:
         """Return whether the next action of a lane may depend on the images, as `looks` of an `Agent`."""
-
-
-@runtime_checkable
-class Expert(Agent, Protocol):
-    """Agent that may also label the states that another agent reaches, as `job=improve` needs it."""
-
-    memoryless: bool  # its action, or the label in `info["clean"]`, depends on the observation alone
 
 
 class Recorder(Protocol):
@@ -448,39 +388,21 @@ class Recorder(Protocol):
 
 
 class Exporter(Protocol):
-    """Writer of episode stores in another format."""
+    """Writer of demonstrations, or with `of_policies = True` of a policy, in another format."""
 
-    def export(self, store: Any, cluster: Any) -> Any:
-        """Write the episodes of a `vla.data.episodes.EpisodeStore` with the workers of a `vla.parallel.pool.Cluster`.
+    def export(self, source: Any, cluster: Any, /) -> Any:
+        """Write a `vla.data.episodes.EpisodeStore` with a `vla.parallel.pool.Cluster`, or a `vla.policy.Policy`.
 
         Returns the path of the export.
         """
 
 
-class PolicyExporter(Protocol):
-    """Writer of policies in another format."""
-
-    def export_policy(self, policy: Any) -> Any:
-        """Write a `vla.policy.Policy`; returns the path of the export."""
-
-
 class Deployment(Protocol):
     """Execution of a policy outside training; built as `Deployment(**yaml, policy=…, environment=…, output=…)`.
 
-    `policy` and `environment` are factories of the checkpoint's policy and of its task's environment, called on demand;
-    `output` is a folder to write to. A class with `needs_policy = False` runs without a checkpoint, one with
-    `needs_environment = True` always builds the environment.
+    `policy` and `environment` are factories of the checkpoint's policy and its task's environment, `output` a folder. A
+    class with `needs_policy = False` runs without a checkpoint, one with `needs_environment = True` always builds it.
     """
 
     def run(self) -> Any:
         """Run until finished or interrupted; returns a `vla.rollouts.results.Report` if success was measured."""
-
-
-def readable(unit: str) -> tuple[float, str]:
-    """Return the factor from the unit of an action to the one for display, and that unit; "" for none."""
-    return {"m": (1000.0, "mm"), "rad": (180 / math.pi, "deg"), "1": (1.0, "")}.get(unit, (1.0, unit))
-
-
-def in_brackets(unit: str) -> str:
-    """Format a unit for the title of a plot, as " [m]"; "" for none."""
-    return "" if unit == "1" else f" [{unit}]"

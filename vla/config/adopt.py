@@ -21,7 +21,7 @@ from vla.config.differences import ABSENT, at, differences
 from vla.io.documents import read_yaml, resolved
 from vla.io.errors import UserError
 from vla.models.checkpoint import read_header
-from vla.models.policy_folder import POLICY, REQUIRED_NODES, is_gone, read_policy
+from vla.models.policy_folder import POLICY, REQUIRED_NODES, read_policy
 from vla.models.trunk_folder import is_trunk
 
 LAST = Path("checkpoints/last.ckpt")  # in the folder of a training
@@ -59,10 +59,8 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Return `cfg` with tokenizer, model and data of the policy `cfg.pretrained`, the initial weights of a training.
 
     Rounds with the expert continue the training of that policy: job=improve also takes task, expert, learner,
-    validation, and number and seed of the demonstrations.
-
-    Raises:
-        UserError: there is no such policy, the job does not train, or an override contradicts the weights.
+    validation, and number and seed of the demonstrations. There is a UserError if there is no such policy, the job does
+    not train, or an override contradicts the weights.
     """
     if cfg.checkpoint is not None or cfg.job not in ("train", "evaluate", "improve"):
         raise UserError(
@@ -72,10 +70,7 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     if is_trunk(cfg.pretrained):
         return _with_trunk(cfg)
     parsed = _parsed(overrides, ("tokenizer", "model", "experiment"))
-    own = Path(cfg.output) / LAST  # of this training; `pretrained` may have been deleted since
-    gone = own.exists() and is_gone(cfg.pretrained)
-    saved = read_header(own).config if gone else read_policy(cfg.pretrained).config
-    improved = cfg.job == "improve"
+    saved, improved = read_policy(cfg.pretrained).config, cfg.job == "improve"
     parts = (*REQUIRED_NODES, *OF_TRAINING) if improved else ("tokenizer", "model", "data")
     require_no_paths(saved, parts, cfg.pretrained, _given(parsed) if improved else None)
     values = _values(saved, parts)
@@ -103,10 +98,8 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     """Return the config of `run`, to continue it in its folder.
 
     The command line overrides the saved config. From an option of `trainer` only the keys in `MACHINES` are taken; a
-    change of a key in `IDENTITY` is refused by `require_identity` when training starts.
-
-    Raises:
-        UserError: the folder has no training, is not one of the user's own runs, or `cfg` names another policy.
+    change of a key in `IDENTITY` is refused by `require_identity` when training starts. There is a UserError if the
+    folder has no training, is not one of the user's own runs, or `cfg` names another policy.
     """
     if cfg.checkpoint is not None or cfg.pretrained is not None:
         raise UserError(f"resume={cfg.resume} continues a run unchanged: omit checkpoint= and pretrained=")
@@ -114,9 +107,8 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     output = Path(cfg.output).resolve()
     if run.resolve().parent != output.parent and run.resolve() != output:
         raise UserError(
-            f"resume={run} is not among your runs in {output.parent}: a run's config names files and folders, so only "
-            f"your own are resumed. If it is yours, add output={run}; to use somebody else's weights: "
-            f"pretrained={run}"
+            f"resume={run} is not among your runs in {output.parent}, and its config names files and folders: if it "
+            f"is yours, add output={run}; to use somebody else's weights: pretrained={run}"
         )
     if cfg.job == "improve" != saved.get("job"):
         raise UserError(f"resume={run} is a training without rounds: job=improve pretrained={run} improves it")
@@ -154,9 +146,14 @@ def _chosen(saved: Mapping[str, Any], *groups: str) -> dict[str, Any]:
     return {f"chosen.{group}": at(saved, f"chosen.{group}", None) for group in groups}
 
 
-def require_identity(saved: Mapping[str, Any], config: Mapping[str, Any], folder: Path) -> None:
-    """Raise a UserError unless `config` describes the training in a run's `folder`, which has the config `saved`."""
-    before, now = ({key: at(each, key, None) for key in IDENTITY} for each in (saved, config))
+def require_identity(
+    saved: Mapping[str, Any], config: Mapping[str, Any], folder: Path, further: Sequence[str] = ()
+) -> None:
+    """Raise a UserError unless `config` describes the training in a run's `folder`, which has the config `saved`.
+
+    The dotted keys of `IDENTITY`, and `further` ones, must have equal values.
+    """
+    before, now = ({key: at(each, key, None) for key in (*IDENTITY, *further)} for each in (saved, config))
     changed = [key for key, _, _ in differences(before, now)]
     if changed:
         weights = f"; pretrained={folder} starts another from its weights" if (folder / POLICY).exists() else ""

@@ -74,12 +74,15 @@ def locate(key: str, target: Any) -> type:
     return found
 
 
-def require_trusted(source: object, target: Any) -> None:
-    """Raise a UserError if `target`, named by `source`, belongs to a package that can be trusted but is not."""
+def require_trusted(source: object, target: Any, imported: bool = False) -> None:
+    """Raise a UserError if `target`, named by `source`, belongs to a package that can be trusted but is not.
+
+    `imported`: it is the name of a package itself.
+    """
     if not isinstance(target, str) or target.startswith(OWN) or target in LIBRARY or is_trusted(target):
         return
     package, dot, _ = target.partition(".")
-    if dot and can_be_trusted(package):
+    if imported or (dot and can_be_trusted(package)):
         raise UserError(f"{source} names {target}, which is not trusted: add trust=[{package}] if you trust its source")
 
 
@@ -96,14 +99,6 @@ def targets(value: Any) -> list[Any]:
 def packages(value: Any) -> list[Any]:
     """Return every package that a node in a plain value has imported: its argument `package`."""
     return [part["package"] for part in mappings(value) if is_node(part) and "package" in part]
-
-
-def require_trusted_package(source: object, package: Any) -> None:
-    """Raise a UserError if `package`, which `source` has imported, is not trusted."""
-    if not isinstance(package, str) or not is_trusted(package):
-        raise UserError(
-            f"{source} uses {package!r}, which is not trusted: add trust=[{package}] if you trust its source"
-        )
 
 
 def fits(found: type, expected: Any) -> bool:

@@ -29,7 +29,6 @@ from vla.config.annotations import (
     mismatch,
     packages,
     require_trusted,
-    require_trusted_package,
     short,
     takes_path,
     targets,
@@ -81,7 +80,7 @@ GROUPS = {
         Group("policy", ("vla.policy.Policy",), ("model", "spec")),
         Group("agent", ("vla.spec.Agent",), ("spec",), optional=True),
         Group("recorder", ("vla.spec.Recorder",), ("folder",), optional=True),
-        Group("export", ("vla.spec.Exporter", "vla.spec.PolicyExporter")),
+        Group("export", ("vla.spec.Exporter",)),
         Group("deploy", ("vla.spec.Deployment",), ("policy", "environment", "output")),
     )
 }
@@ -117,10 +116,8 @@ def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
     """Build the object that a plain `node` of a group, or of its name in `GROUPS`, describes.
 
     Nested nodes are built first; those with `_partial_: true` become factories; `runtime` is from the program.
-    Unresolved references such as `${seed}` are refused, so the checked mapping is the one that is built.
-
-    Raises:
-        UserError: a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
+    Unresolved references such as `${seed}` are refused, so the checked mapping is the one that is built. There is a
+    UserError for a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
     """
     group = GROUPS[group] if isinstance(group, str) else group
     node = resolved(node, group.name)
@@ -145,11 +142,8 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
     """Check a plain node at `key` against the signature of its class, without the `runtime` arguments.
 
     A factory, a node with `_partial_: true`, lacks the arguments that its caller gives: keyword-only ones, and those
-    that programs give to a group. It belongs within another node only.
-
-    Raises:
-        UserError: the class is no `expected`, or a key is unknown, missing or ill-typed; with its dotted name and the
-            allowed values.
+    that programs give to a group. It belongs within another node only. There is a UserError if the class is no
+    `expected`, or a key is unknown, missing or ill-typed; with its dotted name and the allowed values.
     """
     if not is_node(node):
         raise UserError(f"{key} must be a node with a _target_, got {short(node)}")
@@ -163,7 +157,7 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
     values = {name: value for name, value in node.items() if name not in HYDRA_KEYS}
     check_arguments(key, values, target, runtime, partial, NARROWER.get(node["_target_"], {}))
     if "package" in node:
-        require_trusted_package(key, node["package"])
+        require_trusted(key, node["package"], imported=True)
 
 
 def check_arguments(
@@ -200,7 +194,7 @@ def require_trust(config: Mapping[str, Any], names: Iterable[Any], source: objec
     for target in targets(nodes):
         require_trusted(source, target)
     for package in packages(nodes):
-        require_trusted_package(source, package)
+        require_trusted(source, package, imported=True)
 
 
 def require_no_paths(

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, fields
 from inspect import Parameter
-from pathlib import Path
 from typing import Any
 
 from vla.config.annotations import MissingLibrary, fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_arguments, check_node, makes, require_known
 from vla.config.experiment import Experiment
-from vla.config.nodes import Collection, Evaluation, Rounds, Settings, Validation, with_changes
+from vla.config.nodes import Evaluation, Rounds, Settings, Validation, with_changes
 from vla.config.packages import config_folders
 from vla.io.errors import UserError
 
@@ -41,8 +40,7 @@ class Job:
 def check(experiment: Experiment, job: Job) -> None:
     """Check every node of an experiment that its `job` will build against the signature of its class.
 
-    Raises:
-        UserError: an unknown, missing or ill-typed key, with its dotted name and the allowed values.
+    There is a UserError for an unknown, missing or ill-typed key, with its dotted name and the allowed values.
     """
     config = experiment.nodes
     values = {each.name: config[each.name] for each in fields(Settings) if each.name in config}
@@ -87,7 +85,6 @@ def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None
     settings, validate, evaluate = experiment.settings, experiment.validate, experiment.evaluate
     if settings.checkpoint is None:  # else the seeds of its own training count
         _require_apart(validate, evaluate)
-    _require_different_stores(experiment.collect)
     changed = {}
     if settings.job in ("evaluate", "improve"):
         changed = {f"evaluate.conditions.{name}": changes for name, changes in evaluate.changes.items()}
@@ -120,15 +117,6 @@ def _require_apart(validate: Validation, evaluate: Evaluation) -> None:
         raise UserError(
             f"validate.seed={one.start} and evaluate.seed={other.start} share episodes, but episodes that select the "
             "weights must not evaluate them: change one of the two"
-        )
-
-
-def _require_different_stores(collect: Collection) -> None:
-    folder = Path(collect.folder).resolve()
-    if folder in (Path(more).resolve() for more in collect.more or ()):
-        raise UserError(
-            f"collect.folder and collect.more name the same store, {folder}: omit it in collect.more, which takes "
-            "further stores only, several times if they are to count for more"
         )
 
 

@@ -19,7 +19,6 @@ from vla.config.build import Group, build, require_no_paths
 from vla.config.differences import ABSENT, at, differences
 from vla.config.nodes import Collection, Evaluation, Settings, Validation, with_changes
 from vla.config.origin import SECRET, Origin, find_origin
-from vla.config.packages import trusted, with_trust
 from vla.io.errors import UserError
 from vla.parallel.processes import without_triton
 from vla.spec import Spec, SpecOnly
@@ -42,7 +41,7 @@ PARTS = ("tokenizer", "model")  # of a policy
 
 @dataclass(frozen=True)
 class Experiment:
-    """A checked config. Its factories can be sent to worker processes, with the list of trusted packages."""
+    """A checked config. Its factories can be sent to worker processes, which inherit what is trusted."""
 
     nodes: Node  # plain, resolved
     changes: list[Node] = field(default_factory=list)  # key, value and default of differences from the default, to show
@@ -159,40 +158,33 @@ class Experiment:
         environment.close()
         return environment
 
-    # Factories can be sent to other processes, and are called there with the trust of this one.
-
     def make_environment(self, changes: Mapping[str, Any] | None = None) -> Callable[[], Environment]:
         """Return the factory of the environment, with the `changes` of a condition."""
-        return _with_trust(make_environment, with_changes(self.task, changes or {}))
+        return partial(make_environment, with_changes(self.task, changes or {}))
 
     def make_expert(self) -> Callable[[Environment], Agent]:
         """Return the factory of the expert for an environment."""
-        return _with_trust(make_agent, self.nodes["expert"], "expert")
+        return partial(make_agent, self.nodes["expert"], "expert")
 
     def make_agent(self) -> Callable[[Environment], Agent] | None:
         """Return the factory of the agent that acts in place of a policy, or None."""
         if not (node := self.nodes.get("agent")):
             return None
         # Workers may be in another folder.
-        place = {"folder": str(Path(folder).resolve())} if (folder := self.agent_folder) else {}
-        return _with_trust(make_agent, {**node, **place}, "agent")
-
-    @property
-    def agent_folder(self) -> str | None:
-        """Folder that the agent reads, if any."""
-        return (self.nodes.get("agent") or {}).get("folder")
+        place = {"folder": str(Path(folder).resolve())} if (folder := node.get("folder")) else {}
+        return partial(make_agent, {**node, **place}, "agent")
 
     def make_policy(self, checkpoint: Path | None = None) -> Callable[..., Policy]:
         """Return the factory of the policy in a folder, by default `checkpoint`; a UserError if there is none."""
         checkpoint = checkpoint or self.checkpoint
         if checkpoint is None:
             raise UserError("this needs a trained policy: checkpoint=RUN")
-        return _with_trust(make_policy, self.nodes["policy"], checkpoint, own=True)
+        return partial(make_policy, self.nodes["policy"], checkpoint, own=True)
 
     def make_recorder(self, folder: Path) -> Callable[[], Recorder] | None:
         """Return the factory of the recorder that writes into a folder, or None without a recorder."""
         node = self.nodes.get("recorder")
-        return _with_trust(build, node, "recorder", folder=folder) if node else None
+        return partial(build, node, "recorder", folder=folder) if node else None
 
     def cluster(self) -> Cluster:
         """Build the cluster."""
@@ -211,13 +203,12 @@ class Experiment:
     def learner(self, spec: Spec, origin: Path | None = None, last: Path | None = None) -> Learner:
         """Build the learner with initial weights; without any, fit its tokenizer afterwards with `fit_tokenizer`.
 
+        There is a UserError if one of them is damaged, or the policy has another spec.
+
         Args:
             spec: of the demonstrations.
             origin: folder of the policy that has the weights.
             last: Lightning's checkpoint of this training, which is to continue.
-
-        Raises:
-            UserError: one of them is damaged, or the policy has another spec.
         """
         from vla.models.checkpoint import read_content, weights_of
         from vla.models.policy_folder import read_policy
@@ -268,10 +259,6 @@ class Experiment:
         return self.build("data", folder=store.folder, spec=store.spec, **windows, **episodes)
 
 
-def _with_trust(function: Callable[..., T], *arguments: Any, **named: Any) -> Callable[..., T]:
-    return partial(with_trust, trusted(), function, *arguments, **named)
-
-
 def _without_secrets(values: Any) -> Any:
     if isinstance(values, dict):
         return {name: None if name == SECRET else _without_secrets(value) for name, value in values.items()}
@@ -309,14 +296,13 @@ def make_agent(node: Node, group: str, environment: Environment) -> Agent:
 def make_policy(policy: Node, checkpoint: Path, environment: Environment | None = None, *, own: bool = False) -> Policy:
     """Build the policy in a folder with the options of a policy node.
 
+    There is a UserError if there is no policy, its spec differs from the environment's, or it names what it may not.
+
     Args:
         policy: the node.
         checkpoint: the folder.
         environment: that the policy is to act in.
         own: the policy may name paths and addresses, because it is of this run, or was looked through before.
-
-    Raises:
-        UserError: there is no policy, its spec differs from the environment's, or it names what it may not.
     """
     from vla.models.policy_folder import read_policy
 
@@ -327,15 +313,7 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
         require_no_paths({**saved.config, "model": _model_node(saved.config, saved, weights=True)}, PARTS, checkpoint)
     model = _model(saved.config, saved.spec, saved, weights=True)
     saved.restore(model)
-    try:
-        return build(policy, "policy", model=model, spec=saved.spec)
-    except RuntimeError as error:  # torch.OutOfMemoryError, or one of CUDA itself
-        if "out of memory" not in str(error):
-            raise
-        raise UserError(
-            "the GPU has too little memory for a policy in every process: lower cluster.workers, as in "
-            "cluster.workers=8, or set policy.device=cpu"
-        ) from error
+    return build(policy, "policy", model=model, spec=saved.spec)
 
 
 def training_policy(precision: str, model: Model) -> Policy:

@@ -78,8 +78,7 @@ class Validation:
 class Evaluation:
     """Episodes of an evaluation, what they are to decide, and further conditions on the same seeds.
 
-    Raises:
-        UserError: two conditions have one name.
+    There is a UserError if two conditions have one name.
     """
 
     episodes: Count  # with `until`, at most
@@ -126,8 +125,6 @@ class Rounds:
     episodes: Count  # in every round
     seed: Seed  # of the first episode; the others follow it, round by round
     steps: Count  # of training after every round
-    beta: Share  # probability that the expert acts in a segment of an episode
-    segment: Count  # [steps]
     changes: Changes  # to the task in these episodes
 
     @property
@@ -177,15 +174,13 @@ class Inspection:
 class Benchmark:
     """Stages that `job=benchmark` measures, and how often."""
 
-    names: Annotated[list[Literal["collect", "loader", "train", "policy", "evaluate", "deploy", "serve"]], MinLen(1)]
+    names: Annotated[list[Literal["collect", "loader", "train", "policy", "evaluate"]], MinLen(1)]
     episodes: Count  # of the expert
     batches: Count  # of windows
     steps: Count  # of training and of the policy
     rounds: Count  # of training, interleaved
-    precisions: list[Literal["fp32", "bf16"]] | None  # None: those that are fast here
-    compile: list[bool]
-    robosuite: str | None  # Python interpreter with robosuite
-    lerobot: str | None  # Python interpreter with lerobot
+    precisions: Annotated[list[Literal["fp32", "bf16"]], MinLen(1)]
+    compile: Annotated[list[bool], MinLen(1)]
 
 
 def conditions(together: Mapping[str, Changes], one_by_one: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -18,20 +18,7 @@ from vla.parallel.limits import cores, processor
 
 SECRET = "api_key"  # key whose values no file is to hold
 SECONDS = 10  # that git may take
-
-
-@dataclass(frozen=True)
-class Commit:
-    """Commit of a git work tree."""
-
-    __pydantic_config__ = STRICT
-
-    hash: str
-    dirty: bool  # the code in the tree has changes that are not committed, or files that git does not know
-
-    def __str__(self) -> str:
-        """Format the hash, and whether it is all."""
-        return self.hash[:12] + (" with uncommitted changes" if self.dirty else "")
+DIRTY = "with uncommitted changes"  # in the code of a tree
 
 
 @dataclass(frozen=True)
@@ -41,7 +28,7 @@ class Origin:
     __pydantic_config__ = STRICT
 
     command: str  # empty if it is unknown; secrets are replaced by asterisks
-    commits: dict[str, Commit]  # name of a git work tree with code → its commit
+    commits: dict[str, str]  # name of a git work tree with code → its commit, and whether that is all
     host: str
     processor: str
 
@@ -59,22 +46,23 @@ def _without_secret(override: str) -> str:
     return f"{override.partition('=')[0]}=***" if SECRET in override else override
 
 
-def _commits() -> dict[str, Commit]:
+def _commits() -> dict[str, str]:
     """Return the commits of this package, of its options, and of the packages that add parts."""
     packages = {"vla", *option_packages(), *(name.partition(".")[0] for name in trusted())}
     specs = [find_spec(package) for package in sorted(packages)]
     places = [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
-    found = dict[str, Commit]()
+    found = dict[str, str]()
     for folder in (*places, *config_folders()):
         # A package that is installed into an ignored folder of a tree does not belong to it.
         if not folder.is_dir() or _git(folder, "check-ignore", "-q", ".") is not None:
             continue
         if (known := _git(folder, "rev-parse", "--show-toplevel", "HEAD")) is not None:
             tree, commit = known.splitlines()
-            dirty = bool(_git(folder, "--no-optional-locks", "status", "--porcelain", "--", "."))
-            name = Path(tree).name
-            found[name] = Commit(commit, dirty or (name in found and found[name].dirty))
-    return found
+            # Files that git does not know can be chosen, too.
+            if _git(folder, "--no-optional-locks", "status", "--porcelain", "--", ".") or DIRTY in found.get(tree, ""):
+                commit = f"{commit} {DIRTY}"
+            found[tree] = commit
+    return {Path(tree).name: commit for tree, commit in found.items()}
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

@@ -6,7 +6,6 @@ are built only if the user trusts the package by name, or chooses the class on t
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 import sys
@@ -18,16 +17,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 
-from vla.io.documents import read_json
 from vla.io.errors import UserError
-from vla.io.files import write_json
-
-log = logging.getLogger(__name__)
 
 TRUST = "VLA_TRUST"  # environment variable of the user: packages, separated by commas
 TRUSTED = "VLA_TRUSTED"  # environment variable that passes trusted packages and classes to child processes
@@ -38,7 +32,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 CONF = next(path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if (path / "config.yaml").is_file())
 
 
-class InstalledOptions(SearchPathPlugin):
+class _InstalledOptions(SearchPathPlugin):
     """Adds the options of installed packages to Hydra's search path, after those of `vla`, which take precedence."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
@@ -49,7 +43,7 @@ class InstalledOptions(SearchPathPlugin):
 
 def offer_options() -> None:
     """Register the options of installed packages with Hydra."""
-    Plugins.instance().register(InstalledOptions)
+    Plugins.instance().register(_InstalledOptions)
 
 
 @cache
@@ -102,8 +96,8 @@ def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> Non
 
 
 @contextmanager
-def trusting(packages: Sequence[str], checkpoint: Path) -> Iterator[None]:
-    """Trust further packages within the context, and what this user trusted in the training of a policy."""
+def trusting(packages: Sequence[str]) -> Iterator[None]:
+    """Trust further packages within the context; a UserError if they cannot be trusted."""
     if isinstance(packages, str):
         raise UserError(f"trust must be a list of packages, as in trust=[{packages!r}], got {packages!r}")
     for name in packages:
@@ -111,43 +105,11 @@ def trusting(packages: Sequence[str], checkpoint: Path) -> Iterator[None]:
     before = os.environ.get(TRUSTED)
     _trust_also(packages)
     try:
-        trust_own(checkpoint)
         yield
     finally:
         del os.environ[TRUSTED]
         if before is not None:
             os.environ[TRUSTED] = before
-
-
-def _own_trainings() -> Path:
-    """Return the file, outside all runs, of folder of a training → what this user trusted in it."""
-    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state"
-    return Path(state) / "vla" / "trusted.json"
-
-
-def remember_trust(run: Path) -> None:
-    """Note what is trusted for the training in a folder: its policies are trusted as much when they are used."""
-    file = _own_trainings()
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(f"{file}.lock"):
-            known = read_json(file, dict[str, list[str]]) if file.exists() else {}
-            if trusted() != known.get(str(run.resolve()), []):
-                known = {folder: names for folder, names in known.items() if Path(folder).is_dir()}
-                write_json(file, known | {str(run.resolve()): trusted()})
-    except (OSError, ValueError) as error:
-        log.warning("policies of this training need trust=[…] when they are used: %s", error)
-
-
-def trust_own(path: Path) -> None:
-    """Trust what this user trusted in the training whose folder is, or holds, `path`; else nothing further."""
-    try:
-        known = read_json(_own_trainings(), dict[str, list[str]]) if _own_trainings().exists() else {}
-    except (OSError, ValueError) as error:
-        log.warning("what was trusted in earlier trainings is unknown: %s", error)
-        return
-    folders = [path.resolve(), *path.resolve().parents]
-    _trust_also(name for each in folders for name in known.get(str(each), []))
 
 
 def _trust_also(names: Iterable[str]) -> None:
@@ -159,9 +121,9 @@ def trusted() -> list[str]:
     return _names(TRUSTED if TRUSTED in os.environ else TRUST)
 
 
-def is_trusted(target: str) -> bool:
-    """Return whether the third-party class `target` may be built."""
-    matches = any(f"{target}.".startswith(f"{name}.") for name in trusted())
+def is_trusted(target: Any) -> bool:
+    """Return whether the third-party class or package `target` may be used."""
+    matches = isinstance(target, str) and any(f"{target}.".startswith(f"{name}.") for name in trusted())
     return matches and can_be_trusted(target.partition(".")[0])
 
 
@@ -184,18 +146,10 @@ def can_be_trusted(package: str) -> bool:
     return all(map(_made_for, packages_distributions().get(package, ())))
 
 
-def with_trust(names: list[str], function: Any, *arguments: Any, **named: Any) -> Any:
-    """Call a function in a process of this or another machine with the trust of the calling process."""
-    _trust_also(names)
-    return function(*arguments, **named)
-
-
 def _names(variable: str) -> list[str]:
     return [name for each in os.environ.get(variable, "").split(",") if (name := each.strip())]
 
 
 def _made_for(distribution: str) -> bool:
     needed = [requirement for requirement in requires(distribution) or () if "extra ==" not in requirement]
-    return any(
-        re.fullmatch(r"(vla|gymnasium)\b(?![.-]).*", requirement, re.DOTALL | re.IGNORECASE) for requirement in needed
-    )
+    return any(re.match(r"(vla|gymnasium)\b(?![.-])", requirement, re.IGNORECASE) for requirement in needed)

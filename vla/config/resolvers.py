@@ -43,8 +43,7 @@ def recorded(name: str, *, _root_: DictConfig) -> Any:
     """Resolve `${recorded:NAME}`: an attribute of the `Recording` that the expert reads, or `low` or `high`, the bounds
     of the task's actions.
 
-    Raises:
-        UserError: the expert reads no recording, or there is none.
+    There is a UserError if the expert reads no recording, or there is none.
     """
     found = _recording(json.dumps(OmegaConf.to_container(_root_.expert, resolve=True)))
     if name not in ("low", "high"):

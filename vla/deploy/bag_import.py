@@ -50,7 +50,7 @@ class BagDemonstrations(ImportedDemonstrations):
     did, as when an arm is guided by hand, the measured one. The gripper's is its last command, or its measured opening
     if there is none in the bag. Actions beyond the bounds of the task are clipped, depth is 0 (no return). Whether an
     episode succeeded is not known: its outcome is "unverified". Its draws list the steps in which a person acted,
-    `expert_acts`, as in `job=improve`, and their share, `recorded.corrected`.
+    `expert_acts`, and their share, `recorded.corrected`.
 
     Args:
         folder: of the bag.

@@ -71,10 +71,12 @@ class ProgramExporter:
         folder: output folder, which must not exist.
     """
 
+    of_policies = True
+
     def __init__(self, folder: Text | Path) -> None:
         self._folder = Path(folder).resolve()
 
-    def export_policy(self, policy: Policy) -> Path:
+    def export(self, policy: Policy) -> Path:
         """Write the programs of a policy, in float32 for the CPU whatever its device is; returns the folder.
 
         Raises:

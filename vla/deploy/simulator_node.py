@@ -20,7 +20,7 @@ from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.messages import SimulatedEpisode
 from vla.deploy.settings import Topics
 from vla.io.errors import UserError
-from vla.spec import LONGEST_INSTRUCTION, Array, Environment, MultiInstruction, TakesJointTargets
+from vla.spec import LONGEST_INSTRUCTION, Array, Environment, TakesJointTargets
 
 
 class SimulatorNode(Node):
@@ -76,7 +76,7 @@ class SimulatorNode(Node):
         """Start the next episode."""
         self.seed += 1
         self.instruction = self.environment.reset(self.seed).instruction
-        if isinstance(self.environment, MultiInstruction) and self.environment.instructions > 1:
+        if getattr(self.environment, "instructions", 1) > 1:
             raise UserError("deploy=simulator waits for one instruction per episode: set task.goal.length=1")
         self._target = self._hold_command()
         self._commanded_at: float | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Iterable
 from typing import Any, TypeVar
@@ -24,6 +25,11 @@ class Formatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Format a record, as `printable` text."""
         return printable(super().format(record))
+
+
+def readable(unit: str) -> tuple[float, str]:
+    """Return the factor from the unit of an action to the one for display, and that unit; "" for none."""
+    return {"m": (1000.0, "mm"), "rad": (180 / math.pi, "deg"), "1": (1.0, "")}.get(unit, (1.0, unit))
 
 
 def show(renderable: Any) -> None:

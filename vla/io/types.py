@@ -6,6 +6,7 @@ Validation also requires every float to be finite.
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
@@ -20,6 +21,11 @@ def ascending(values: Sequence[float]) -> bool:
 def unique(values: Sequence[Any]) -> bool:
     """without repetitions"""
     return len({repr(value) for value in values}) == len(values)
+
+
+def names_a_file(name: str) -> bool:
+    """usable in a file name"""
+    return re.fullmatch(r"\w[\w.-]*", name) is not None
 
 
 Natural = Annotated[int, Ge(0), Le(2**31 - 1)]

@@ -48,8 +48,7 @@ JOBS = {
 def find(name: str) -> Job:
     """Return the requirements of a job: one of `JOBS`, or `JOB` in the module that `name` is, of a trusted package.
 
-    Raises:
-        UserError: there is no such job, or its package is not trusted.
+    There is a UserError if there is no such job, or its package is not trusted.
     """
     if name in JOBS:
         return JOBS[name]
@@ -78,8 +77,7 @@ def builds_world(experiment: Experiment) -> bool:
 def run(experiment: Experiment) -> float | None:
     """Run the job of an experiment; evaluation returns the success rate, which sweeps maximise.
 
-    Raises:
-        UserError: the config compiles a model, and this machine cannot; or an error of the job.
+    There is a UserError if the config compiles a model, and this machine cannot; or an error of the job.
     """
     name = experiment.settings.job
     groups = find(name).needs(experiment.config)

@@ -24,8 +24,7 @@ def run(experiment: Experiment) -> None:
 def demonstrations(experiment: Experiment) -> EpisodeStore:
     """Return the episode store of an experiment, limited to `collect.episodes`; collect missing episodes.
 
-    Raises:
-        UserError: the store has episodes of another experiment, or collection fails.
+    There is a UserError if the store has episodes of another experiment, or collection fails.
     """
     wanted = experiment.collect
     if wanted.seed + wanted.episodes > FIRST_SEED:
@@ -50,8 +49,8 @@ def demonstration_spec(experiment: Experiment) -> Spec:
 def complete_store(experiment: Experiment) -> EpisodeStore | None:
     """Return the episode store of an experiment if it has enough episodes.
 
-    Raises:
-        UserError: the store was collected with another task, expert or first seed, or its images have other losses.
+    There is a UserError if the store was collected with another task, expert or first seed, or its images have other
+    losses.
     """
     wanted = experiment.collect
     if not is_store(Path(wanted.folder)):

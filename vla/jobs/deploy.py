@@ -17,29 +17,23 @@ from vla.runs.folder import PLOT, REPORT
 def run(experiment: Experiment) -> None:
     """Run the deployment until done or interrupted; report a measured success rate like an evaluation.
 
-    Raises:
-        UserError: an episode to be played selected the weights; or one ended in an error, which the report contains.
+    There is a UserError if an episode to be played selected the weights; or one ended in an error, which the report
+    contains.
     """
     seed, episodes = (at(experiment["deploy"], key, None) for key in ("simulator.seed", "episodes"))
     if experiment.checkpoint is not None and seed is not None and episodes is not None:
         require_unseen(experiment.checkpoint, "deploy.simulator.seed", range(seed, seed + episodes))
-    report = deployment(experiment).run()
-    if report is not None:
+    policy, environment = partial(_policy, experiment), experiment.make_environment()
+    deployment = experiment.build("deploy", policy=policy, environment=environment, output=experiment.output)
+    if getattr(deployment, "needs_policy", True) and experiment.checkpoint is experiment.make_agent() is None:
+        raise UserError("this deployment needs a trained policy: checkpoint=RUN")
+    if (report := deployment.run()) is not None:
         output = experiment.output
         write_report(report, output / REPORT, experiment.settings.checkpoint, experiment.config)
         plot_report(report, output / PLOT)
         print(printable(str(report)))
         if report.errors:
             raise UserError(f"the episodes ended with an error, see {output / REPORT}: {report.errors[0].error}")
-
-
-def deployment(experiment: Experiment) -> Any:
-    """Build the deployment of an experiment; a UserError if it needs a policy, and there is none."""
-    policy, environment = partial(_policy, experiment), experiment.make_environment()
-    built = experiment.build("deploy", policy=policy, environment=environment, output=experiment.output)
-    if getattr(built, "needs_policy", True) and experiment.checkpoint is experiment.make_agent() is None:
-        raise UserError("this deployment needs a trained policy: checkpoint=RUN")
-    return built
 
 
 def _policy(experiment: Experiment) -> Any:

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict, dataclass, replace
+from contextlib import closing, contextmanager
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from vla.config.annotations import locate
 from vla.config.build import Group, build
+from vla.config.differences import NOT_COMPARED
 from vla.config.experiment import Experiment
 from vla.config.nodes import NEAREST, with_changes
 from vla.io.errors import UserError
@@ -22,12 +23,12 @@ from vla.io.files import warn_on_error, writing
 from vla.io.printable import printable, show
 from vla.io.versions import installed_versions
 from vla.models.chunking import require_fit
-from vla.models.policy_folder import is_gone, require_unseen
+from vla.models.policy_folder import read_policy, require_unseen
 from vla.policy import costs
 from vla.reports.evaluation import plot_report, write_report
-from vla.reports.result_tables import SecondaryRows, conditions_table, plot_conditions, secondary_table
+from vla.reports.result_tables import conditions_table, plot_conditions, secondary_table
 from vla.reports.run_page import write_page
-from vla.rollouts.comparison import compare_conditions, compare_secondary_metrics
+from vla.rollouts.comparison import compare_conditions
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.memorisation import make_nearest, make_without, open_memory
 from vla.rollouts.realtime import make_over_network
@@ -36,7 +37,6 @@ from vla.rollouts.results import Report
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory
 from vla.rollouts.shared_policy import shared_policy
 from vla.rollouts.statements import AgainstBar, AgainstRun, Statement, differs_clearly
-from vla.runs.files import Round
 from vla.runs.folder import (
     CHECKPOINTS,
     PAGE,
@@ -48,10 +48,9 @@ from vla.runs.folder import (
     described,
     require_run,
     save_config,
-    wall_time,
 )
 from vla.runs.played import Played
-from vla.runs.resume import cached_success, training_lock
+from vla.runs.resume import cached_success
 from vla.schedule import Delays
 from vla.spec import IN_DISTRIBUTION, Multitask
 
@@ -74,8 +73,7 @@ def run(experiment: Experiment) -> float | None:
         return evaluated(experiment, checkpoint)
     from vla.jobs.open_loop import evaluate_open_loop  # imports Lightning, which takes seconds, as training does
 
-    with _lock(experiment, checkpoint):
-        return evaluate_open_loop(experiment, checkpoint)
+    return evaluate_open_loop(experiment, checkpoint)
 
 
 def _trained(experiment: Experiment) -> Path | None:
@@ -85,36 +83,32 @@ def _trained(experiment: Experiment) -> Path | None:
     if experiment.playable or experiment.held_out:
         return train(experiment)
     log.warning("data.validation_fraction=0 trains on all episodes and leaves none to evaluate the policy on")
-    train(experiment.with_values({"job": "train"}))  # else resume=last would wait for an evaluation
+    train(experiment)
     return None
 
 
-def evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round] = ()) -> float:
-    """Return the success rate of a policy, trained in `rounds` if given, or of the agent of the config.
+def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
+    """Return the success rate of a policy, or of the agent of the config.
 
-    Finished evaluations are kept, and of unfinished ones the episodes that were played. If an episode ended in an error
-    the report is written and contains it, then a UserError is raised.
+    A finished evaluation is kept, and of an unfinished one the episodes that were played. If an episode ended in an
+    error the report is written and contains it, then a UserError is raised.
     """
-    output, wanted = experiment.output, experiment.evaluate
+    output = experiment.output
     if checkpoint and (known := cached_success(output, experiment.config, checkpoint)) is not None:
         return known
     statements, conclusions = _statements(experiment), list[str]()
     _ = experiment.origin  # of the code that is evaluated, not of later changes
-    sources = [checkpoint, experiment.agent_folder, wanted.nearest]
-    paths = [Path(each) for each in sources if each is not None]
     try:
         with (
-            _lock(experiment, checkpoint),
-            Played(output, paths, experiment.config, installed_versions()) as played,
+            Played(output, _identity(experiment, checkpoint)) as played,
             policy_for_workers(experiment, checkpoint) as make_policy,
         ):
             reports = _play(experiment, make_policy, statements, played)
             report = reports[IN_DISTRIBUTION]
-            conclusions += [*(each.say(report) for each in statements), str(report)]
+            said = [each.say(report) for each in statements]
+            conclusions += [*said, str(report)]
             with writing(output / REPORT):
-                facts = _facts(experiment, checkpoint, rounds, played.seconds)
-                facts["statements"] = [each.say(report) for each in statements]
-                _write(experiment, checkpoint, reports, facts)
+                _write(experiment, checkpoint, reports, {**_facts(experiment, checkpoint), "statements": said})
             if errors := _errors(reports):  # what was played is kept, so that the same command plays only these again
                 raise UserError(f"{errors} episodes ended in an error, see {output / REPORT}")
     finally:
@@ -123,10 +117,11 @@ def evaluated(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[
     return report.success
 
 
-def _lock(experiment: Experiment, checkpoint: Path | None) -> AbstractContextManager[None]:
-    """Lock the training of a policy of this run, which resume=last would else find interrupted."""
-    own = checkpoint is not None and checkpoint.resolve().is_relative_to(experiment.output.resolve())
-    return training_lock(checkpoint.parent / CHECKPOINTS) if checkpoint and own else nullcontext()
+def _identity(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]:
+    """Return what determines the results of an evaluation."""
+    config = {name: node for name, node in experiment.config.items() if name not in NOT_COMPARED}
+    weights = read_policy(checkpoint).training.weights if checkpoint else None
+    return {"weights": weights, "versions": installed_versions(), "config": config}
 
 
 @contextmanager
@@ -147,44 +142,27 @@ def _is_shared(experiment: Experiment) -> bool:
     return experiment["cluster"].get("policy") == "here"
 
 
-@dataclass(frozen=True)
-class _Condition:
-    """A world and an agent that plays in it on the seeds of the evaluation."""
-
-    name: str
-    make_environment: EnvironmentFactory
-    make_agent: AgentFactory
-
-
-def _conditions(experiment: Experiment, make_agent: AgentFactory) -> list[_Condition]:
-    """Return the training condition, then those that change its world or its agent.
+def _conditions(experiment: Experiment, make_agent: AgentFactory) -> dict[str, tuple[EnvironmentFactory, AgentFactory]]:
+    """Return condition → world and agent: the training condition, then those that change its world or its agent.
 
     Other agents are the same one without a modality or at the other end of a network, and the nearest demonstration.
     """
-    wanted, task, world = experiment.evaluate, experiment.task, experiment.make_environment()
-    agents: dict[str, AgentFactory] = {
-        f"without_{each}": partial(make_without, make_agent, each) for each in wanted.without
-    }
+    wanted, world = experiment.evaluate, experiment.make_environment()
+    found = {IN_DISTRIBUTION: (world, make_agent)}
+    for name, changes in wanted.changes.items():
+        if with_changes(experiment.task, changes) != experiment.task:
+            found[name] = experiment.make_environment(changes), make_agent
+    for each in wanted.without:
+        found[f"without_{each}"] = world, partial(make_without, make_agent, each)
     if wanted.nearest:
-        agents[NEAREST] = partial(make_nearest, Path(wanted.nearest).resolve())
+        found[NEAREST] = world, partial(make_nearest, Path(wanted.nearest).resolve())
     for name, node in wanted.networks.items():
-        agents[name] = partial(make_over_network, make_agent, build(node, NETWORK))
-    return [
-        _Condition(IN_DISTRIBUTION, world, make_agent),
-        *(
-            _Condition(name, experiment.make_environment(changes), make_agent)
-            for name, changes in wanted.changes.items()
-            if with_changes(task, changes) != task
-        ),
-        *(_Condition(name, world, agent) for name, agent in agents.items()),
-    ]
+        found[name] = world, partial(make_over_network, make_agent, build(node, NETWORK))
+    return found
 
 
 def _play(
-    experiment: Experiment,
-    make_policy: AgentFactory | None,
-    statements: Sequence[Statement],
-    played: Played,
+    experiment: Experiment, make_policy: AgentFactory | None, statements: Sequence[Statement], played: Played
 ) -> dict[str, Report]:
     """Return condition → report on the same seeds; only the first, the training condition, is recorded.
 
@@ -196,29 +174,28 @@ def _play(
     assert make_agent is not None, "there is a checkpoint"
     if make_recorder:
         recordings.mkdir(exist_ok=True)
-    if not len(played):
+    if not any(played.results.values()):
         clear(recordings)
     world = experiment.world() if wanted.until else None
     turns = len(world.tasks) if isinstance(world, Multitask) else 1
     lanes = 1 if _is_shared(experiment) else (experiment["policy"] or {}).get("lanes", 1)  # else lanes are workers
-    play = partial(evaluate, cluster=experiment.cluster(), turns=turns, lanes=lanes)
-    tiers = experiment.task.get("tiers") or {}  # of worlds that have them
+    play = partial(evaluate, cluster=experiment.cluster(), turns=turns, lanes=lanes, recordings=wanted.recordings)
     conditions, reports, seeds = _conditions(experiment, make_agent), dict[str, Report](), list(wanted.seeds)
     until = (lambda so_far: all(each.is_decided(so_far) for each in statements)) if statements else None
-    for each in conditions:
-        first = each is conditions[0]
-        report = play(
-            *(each.make_environment, each.make_agent, make_recorder if first else None, seeds),
-            name="as configured" if first else each.name,
+    for name, makers in conditions.items():
+        first = name == IN_DISTRIBUTION
+        reports[name] = play(
+            *(*makers, make_recorder if first else None, seeds),
+            name="as configured" if first else name,
             until=until if wanted.until else None,
-            recordings=wanted.recordings,
-            known=played.of(each.name),
-            keep=partial(played.add, each.name),
+            known=played.results[name],
+            keep=partial(played.add, name),
         )
-        reports[each.name] = replace(report, tiers=tiers)
         if first:
-            seeds = [result.seed for result in report.results]
-            until = partial(differs_clearly, report, wanted.margin, len(conditions) - 1)
+            seeds = [result.seed for result in reports[name].results]
+            until = partial(differs_clearly, reports[name], wanted.margin, len(conditions) - 1)
+    tiers = experiment.task.get("tiers") or {}  # of worlds that have them
+    reports = {name: replace(report, tiers=tiers) for name, report in reports.items()}
     # A condition that changes nothing is the first one.
     return {name: reports.get(name, reports[IN_DISTRIBUTION]) for name in (IN_DISTRIBUTION, *wanted.changes, *reports)}
 
@@ -226,13 +203,12 @@ def _play(
 def require_possible(experiment: Experiment) -> None:
     """Check, before any work, that the evaluation can be completed.
 
-    Raises:
-        UserError: there is no such run to compare with, nothing to decide, no such network or store, or no world to
-            change; or its episodes selected the weights.
+    There is a UserError if there is no such run to compare with, nothing to decide, no such network or store, or no
+    world to change; or its episodes selected the weights.
     """
     wanted, settings = experiment.evaluate, experiment.settings
     for name in (settings.checkpoint, settings.pretrained):
-        if name and not is_gone(name):  # initial weights may have been deleted since
+        if name:
             require_unseen(name, "evaluate.seed", wanted.seeds)  # whatever `validate` is now
     _statements(experiment)
     for node in wanted.networks.values():
@@ -249,32 +225,18 @@ def require_possible(experiment: Experiment) -> None:
     output = Path(settings.output)  # not created yet
     if settings.job != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
         raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
-    if experiment.playable:
-        # Worlds take time to compile: of conditions that change the same arguments one is built; all nodes are checked.
-        kinds = {frozenset(changes): (name, changes) for name, changes in reversed(wanted.changes.items())}
-        for name, changes in kinds.values():
-            _require_world(experiment, name, changes)
-
-
-def _require_world(experiment: Experiment, name: str, changes: Mapping[str, Any]) -> None:
-    """Raise a UserError if there is no episode under a condition, such as with more blocks than colours."""
-    try:
-        world = experiment.make_environment(changes)()
+    # Worlds take time to compile: of conditions that change the same arguments one is built; all nodes are checked.
+    kinds = {frozenset(changes): (name, changes) for name, changes in reversed(wanted.changes.items())}
+    for name, changes in kinds.values() if experiment.playable else ():
         try:
-            with world.blind():
-                world.reset(experiment.evaluate.seed)
-        finally:
-            world.close()
-    except ValueError as error:
-        raise UserError(f"condition {name} of the evaluation: {error}") from error
+            with closing(experiment.make_environment(changes)()) as world, world.blind():
+                world.reset(wanted.seed)  # such as with more blocks than colours
+        except ValueError as error:
+            raise UserError(f"condition {name} of the evaluation: {error}") from error
 
 
 def _statements(experiment: Experiment) -> list[Statement]:
-    """Build the statements on the training condition that the evaluation must decide.
-
-    Raises:
-        UserError: there is no such run to compare with, or nothing to decide.
-    """
+    """Build the statements to decide; a UserError if there is no such run to compare with, or nothing to decide."""
     wanted, found = experiment.evaluate, list[Statement]()
     if wanted.bar is not None:
         found.append(AgainstBar(wanted.bar))
@@ -310,15 +272,14 @@ def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, R
     """Write all results of an evaluation; `facts` are further entries of its report."""
     output, wanted, report = experiment.output, experiment.evaluate, reports[IN_DISTRIBUTION]
     others = {name: each for name, each in reports.items() if name != IN_DISTRIBUTION}
-    compared, secondary = compare_conditions(reports, wanted.margin), compare_secondary_metrics(reports)
+    compared = compare_conditions(reports, wanted.margin)
     save_config(output, experiment.config, experiment.changes)
     recording = output / RECORDING
     for earlier in (recording, output / SUITE):
         earlier.unlink(missing_ok=True)
-    if experiment["recorder"]:
+    if experiment["recorder"] and not _errors(reports):  # else the same command continues
         with warn_on_error(recording):
-            continues = _errors(reports) > 0
-            facts["recorded"] = keep_recordings(report, output / RECORDINGS, recording, wanted.recordings, continues)
+            facts["recorded"] = keep_recordings(report, output / RECORDINGS, recording, wanted.recordings)
     with warn_on_error(output / PLOT):
         (output / PLOT).unlink(missing_ok=True)  # of an earlier evaluation
         plot_report(report, output / PLOT)
@@ -326,14 +287,12 @@ def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, R
         with warn_on_error(output / SUITE):
             plot_conditions(reports, output / SUITE)
         show(conditions_table(reports, compared))
-        rows: SecondaryRows = {
-            (name,): metrics for name, metrics in secondary.items() if metrics and reports[name] is not report
-        }
-        if rows:
-            show(secondary_table(rows, ["condition"]))
+        secondary = secondary_table({(name,): each for name, each in compared.items() if reports[name] is not report})
+        if secondary.rows:
+            show(secondary)
     used = str(checkpoint) if checkpoint else None
     # Last, because its existence marks the evaluation as finished.
-    write_report(report, output / REPORT, used, experiment.config, facts, others, compared, secondary)
+    write_report(report, output / REPORT, used, experiment.config, facts, others, compared)
     page = None
     with warn_on_error(output / PAGE):
         page = write_page(output)
@@ -345,16 +304,7 @@ def _errors(reports: Mapping[str, Report]) -> int:
     return sum(len(each.errors) for each in {id(each): each for each in reports.values()}.values())
 
 
-def _facts(experiment: Experiment, checkpoint: Path | None, rounds: Sequence[Round], seconds: float) -> dict[str, Any]:
-    """Return the entries of a report that describe the agent, given the duration of its evaluation [s]."""
+def _facts(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]:
+    """Return the entries of a report that describe the agent."""
     facts = {**experiment.settings.chosen, "versions": installed_versions(), "origin": asdict(experiment.origin)}
-    if checkpoint is None:
-        return {**facts, "model": facts["agent"], "wall_time_s": seconds}
-    # The last training is read from its own folder.
-    before = sum(each.collection_s + each.training_s for each in rounds) - (rounds[-1].training_s if rounds else 0.0)
-    return {
-        **facts,
-        **costs(experiment.make_policy(checkpoint)()),
-        "wall_time_s": wall_time(checkpoint, seconds + before),
-        "rounds": [asdict(one) for one in rounds],
-    }
+    return facts | (costs(experiment.make_policy(checkpoint)()) if checkpoint else {"model": facts["agent"]})

@@ -13,11 +13,10 @@ log = logging.getLogger(__name__)
 def run(experiment: Experiment) -> None:
     """Export demonstrations or a policy, depending on the exporter.
 
-    Raises:
-        UserError: the exporter needs a policy, and no checkpoint is given.
+    There is a UserError if the exporter needs a policy, and no checkpoint is given.
     """
     exporter = experiment.build("export")
-    if hasattr(exporter, "export_policy"):
-        log.info("wrote %s", exporter.export_policy(experiment.make_policy()()))
+    if getattr(exporter, "of_policies", False):
+        log.info("wrote %s", exporter.export(experiment.make_policy()()))
     else:
         log.info("wrote %s", exporter.export(demonstrations(experiment), experiment.cluster()))

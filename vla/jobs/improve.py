@@ -2,8 +2,8 @@
 
 S. Ross, G. Gordon, J. A. Bagnell, A Reduction of Imitation Learning and Structured Prediction to No-Regret Online
 Learning, AISTATS 2011 (arXiv 1011.0686), algorithm 3.1. The demonstrations are its first round, in which the expert
-acts; in the others the policy does, or both in turns (`improve.beta`). Every round is a run in a folder of its own,
-`round_1`, `round_2`, …, with its episodes beside its checkpoints; `round_0` is the training on demonstrations alone.
+acts; in the others the policy does. Every round is a run in a folder of its own, `round_1`, `round_2`, …, with its
+episodes beside its checkpoints; `round_0` is the training on demonstrations alone.
 """
 
 from __future__ import annotations
@@ -27,10 +27,9 @@ from vla.jobs.collect import complete_store, demonstrations
 from vla.jobs.evaluate import evaluated, policy_for_workers, require_possible
 from vla.jobs.train import train
 from vla.models.policy_folder import read_policy
-from vla.rollouts.collect import collect, collection_time
+from vla.rollouts.collect import collect
 from vla.rollouts.rollout import close_agent
 from vla.rollouts.supervised import make_supervised, require_memoryless
-from vla.runs.files import Round
 from vla.runs.folder import archive_evaluation, read_report, read_run, save_config
 from vla.runs.resume import LENGTHS, training_lock
 from vla.spec import FIRST_SEED
@@ -43,8 +42,8 @@ EPISODES = "episodes"  # the store in the folder of a round
 def run(experiment: Experiment) -> float:
     """Improve a policy in rounds and return its success rate; finished rounds, and parts of one, are kept.
 
-    Raises:
-        UserError: the expert cannot label, seeds are not fresh, or a round of another policy lies in the folder.
+    There is a UserError if the expert cannot label, seeds are not fresh, or a round of another policy lies in the
+    folder.
     """
     seeds = _require_possible(experiment)
     known = complete_store(experiment)
@@ -58,39 +57,30 @@ def run(experiment: Experiment) -> float:
 
 def _improved(experiment: Experiment, seeds: range) -> float:
     asked, output = experiment.options(Rounds), experiment.output
-    checkpoint, rounds, stores = experiment.pretrained, list[Round](), list[Path]()
-    if report := read_report(output):
-        finished = len(report.rounds) - (checkpoint is None)  # without a policy to begin with, round_0 is there, too
-        if finished < asked.rounds:
-            archive_evaluation(output, finished)
+    checkpoint, stores = experiment.pretrained, list[Path]()
+    if (report := read_report(output)) and (finished := at(report.config, "improve.rounds", 0)) < asked.rounds:
+        archive_evaluation(output, finished)
     if checkpoint is None:
         checkpoint = _trained(experiment.with_values({"job": "train", "output": str(output / "round_0")}))
-        rounds.append(_described(output / "round_0", None))
     for number in range(1, asked.rounds + 1):
         folder = output / f"round_{number}"
         store = _labelled(experiment, checkpoint, folder / EPISODES, seeds[(number - 1) * asked.episodes])
         stores.append(store.folder)
+        successes = sum(entry.success for entry in store.episodes)
+        log.info("round %d: %d of %d labelled episodes were successes", number, successes, len(store.episodes))
         checkpoint = _trained(_round(experiment, checkpoint, folder, stores))
-        rounds.append(_described(folder, store))
-        log.info("round %d: %s", number, rounds[-1])
-    return evaluated(experiment, checkpoint, rounds)
+    return evaluated(experiment, checkpoint)
 
 
 def _save_config(experiment: Experiment) -> None:
     """Save the config for `resume=`; a UserError if the folder has rounds of another training, or of another length."""
     saved = read_run(experiment.output).config
     if saved.get("job") == "improve":
-        require_identity(saved, experiment.config, experiment.output)
         # Later trainings continue the earlier ones, which must not get another length.
         begun = is_store(experiment.output / "round_1" / EPISODES)
         lengths = [f"trainer.{name}" for name in LENGTHS] if experiment.pretrained is None else []
-        for key in (*lengths, "improve.steps") if begun else ():
-            before, now = at(saved, key, None), at(experiment.config, key, None)
-            if before != now:
-                raise UserError(
-                    f"{key}={now}: the rounds in {experiment.output} were trained with {before}: leave it at that, or "
-                    "choose another output=DIR"
-                )
+        further = (*lengths, "improve.steps") if begun else ()
+        require_identity(saved, experiment.config, experiment.output, further)
     if saved != experiment.config:  # else its date would tell that the rounds began again
         save_config(experiment.output, experiment.config, experiment.changes)
 
@@ -150,14 +140,14 @@ def _labelled(experiment: Experiment, checkpoint: Path, folder: Path, seed: int)
         "task": task,
         "expert": experiment["expert"],
         "policy": {**experiment["policy"], "weights": read_policy(checkpoint).training.weights[:12]},
-        "improve": {"episodes": asked.episodes, "beta": asked.beta, "segment": asked.segment, "seed": seed},
+        "improve": {"episodes": asked.episodes, "seed": seed},
     }
     world = environment()
     world.close()
     store = EpisodeStore.create_or_open(folder, world.spec, own, experiment.collect.codec)
     with policy_for_workers(experiment, checkpoint) as policy:
         assert policy is not None, "there is a checkpoint"
-        agent = partial(make_supervised, policy, experiment.make_expert(), asked.beta, asked.segment)
+        agent = partial(make_supervised, policy, experiment.make_expert())
         collect(store, environment, agent, asked.episodes, experiment.cluster(), seed, keep_failures=True)
     return EpisodeStore(folder)
 
@@ -182,16 +172,3 @@ def _trained(experiment: Experiment) -> Path:
     checkpoint = train(experiment)
     assert checkpoint is not None, "this is the only process"
     return checkpoint
-
-
-def _described(folder: Path, store: EpisodeStore | None) -> Round:
-    """Summarise a finished round; without a store, the training on demonstrations alone."""
-    found, episodes = read_run(folder), store.episodes if store else []
-    curve = found.metrics.get("val/success")
-    return Round(
-        episodes=len(episodes),
-        successes=sum(entry.success for entry in episodes),
-        collection_s=(collection_time(store, len(episodes)) or 0.0) if store else 0.0,
-        training_s=found.training.seconds if found.training else 0.0,
-        validation=round(float(curve[1][-1]), 6) if curve else None,
-    )

@@ -18,6 +18,7 @@ from vla.io.errors import UserError
 from vla.io.files import warn_on_error
 from vla.io.printable import show
 from vla.reports.dataset_card import store_table, write_card
+from vla.rollouts.results import recording_name
 from vla.rollouts.rollout import replay
 
 log = logging.getLogger(__name__)
@@ -38,8 +39,8 @@ def run(experiment: Experiment) -> None:
 def inspect_store(wanted: Inspection) -> None:
     """Verify and describe a store, or a new one made by merging, filtering or repair.
 
-    Raises:
-        UserError: the store does not exist, cannot be made, or is damaged; its intact episodes are described first.
+    There is a UserError if the store does not exist, cannot be made, or is damaged; its intact episodes are described
+    first.
     """
     findings = verify_store(EpisodeStore(_chosen(wanted), damaged=True))
     show(store_table(findings))
@@ -74,6 +75,8 @@ def replay_episode(
 ) -> None:
     """Replay the actions of a stored episode and compare the states.
 
+    There is a UserError if there is no such episode, or its store does not contain its task, or another robot's.
+
     If `recorded`, write `episode-SEED.rrd`: the episode in the 3-D scene of the replay.
 
     Args:
@@ -81,9 +84,6 @@ def replay_episode(
         folder: of the store.
         seed: of the episode.
         robot: node that replaces the one of the store's task, which may not name files.
-
-    Raises:
-        UserError: there is no such episode, or its store does not contain its task, or another robot's.
     """
     store = EpisodeStore(folder, damaged=True)
     config, episode = find_episode(store, seed)
@@ -96,7 +96,7 @@ def replay_episode(
     store.spec.require(environment.spec, f"the episode store {folder}", "its task as it is built now")
     recorder, written = None, ""
     if recorded:
-        from vla.rollouts.recorder import RerunRecorder, recording_name  # imports the viewer's library
+        from vla.rollouts.recorder import RerunRecorder  # imports the viewer's library
 
         recorder, written = RerunRecorder(output, pictures=0), f"{recording_name(seed, episode.outcome)}.rrd"
     with environment.blind():

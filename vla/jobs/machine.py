@@ -6,17 +6,13 @@ import logging
 import os
 import shlex
 import shutil
-import sys
-import sysconfig
 from collections.abc import Container, Mapping
-from pathlib import Path
 from typing import Any
 
 from vla.io.errors import UserError
 
 log = logging.getLogger(__name__)
 
-COMPILING = {"learner": "trainer", "policy": "policy"}  # group with a key `compile` → group of its device
 DEVICES = {"trainer": "accelerator", "policy": "device"}  # group → key of its device
 
 
@@ -51,31 +47,15 @@ def computes_on_cpu(device: str | None) -> bool:
 
 
 def require_compiler(config: Mapping[str, Any], groups: Container[str]) -> None:
-    """Raise a UserError if a job that builds `groups` compiles a model, and this machine lacks compiler or headers.
+    """Raise a UserError if a job that builds `groups` compiles a model, and this machine has no compiler.
 
-    On a CPU PyTorch calls a C++ compiler, on a GPU Triton calls one of C, and both include the headers of Python.
+    On a CPU PyTorch calls one of C++, on a GPU Triton calls one of C; a package of the former brings the latter.
     """
-    compiling = [
-        (name, "false") for name in COMPILING if name in groups and (config[name] or {}).get("compile") is True
-    ]
-    if "benchmark" in groups and "train" in config["benchmark"]["names"] and any(config["benchmark"]["compile"]):
-        compiling.append(("benchmark", "[false]"))
-    for name, off in compiling:
-        group = COMPILING.get(name, "trainer")
-        if missing := _missing(computes_on_cpu(config[group].get(DEVICES[group]))):
-            raise UserError(f"{name}.compile needs {missing}, or set {name}.compile={off}")
-
-
-def _missing(on_processor: bool) -> str:
-    """Return what this machine lacks to compile, and how to get it; nothing if it can."""
-    if on_processor:
-        known = [os.environ.get("CXX", "clang++" if sys.platform == "darwin" else "g++")]
-        language, package = "C++", "g++"
-    else:
-        known = [os.environ["CC"]] if "CC" in os.environ else ["gcc", "clang"]
-        language, package = "C", "gcc"
-    if not any(shutil.which(shlex.split(each)[0]) for each in known if each.strip()):
-        return f"a {language} compiler, and there is no {' or '.join(known)}: install {package}"
-    if not Path(sysconfig.get_path("include"), "Python.h").is_file():
-        return f"the header files of Python in {sysconfig.get_path('include')}: install python3-dev"
-    return ""
+    known = [os.environ["CXX"]] if "CXX" in os.environ else ["g++", "clang++"]
+    for name in ("learner", "policy"):
+        compiles = name in groups and (config[name] or {}).get("compile") is True
+        if compiles and not any(shutil.which(shlex.split(each)[0]) for each in known if each.strip()):
+            raise UserError(
+                f"{name}.compile needs a C++ compiler, and there is no {' or '.join(known)}: install g++ and "
+                f"python3-dev, or set {name}.compile=false"
+            )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -16,6 +15,7 @@ from vla.config.experiment import Experiment
 from vla.data.datamodule import digest_of, held_out
 from vla.data.episodes import EpisodeStore
 from vla.data.header import is_store
+from vla.data.index import Entry
 from vla.data.verification import episode_of
 from vla.io.errors import UserError
 from vla.io.files import warn_on_error, writing
@@ -27,7 +27,7 @@ from vla.reports.open_loop import components, errors_table, plot_errors, write_e
 from vla.reports.run_page import write_page
 from vla.rollouts.open_loop import OpenLoop, open_loop
 from vla.rollouts.rollout import close_agent
-from vla.runs.folder import ERRORS, ERRORS_PLOT, PAGE, described, save_config, wall_time
+from vla.runs.folder import ERRORS, ERRORS_PLOT, PAGE, described, save_config
 
 log = logging.getLogger(__name__)
 
@@ -35,15 +35,12 @@ log = logging.getLogger(__name__)
 def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float:
     """Measure the errors, write the reports, and return minus the relative error, which sweeps maximise.
 
-    Without a checkpoint the agent of the config is shown the episodes that a training would hold out.
-
-    Raises:
-        UserError: the checkpoint was trained on other episodes, or on all of them.
+    Without a checkpoint the agent of the config is shown the episodes that a training would hold out. There is a
+    UserError if the checkpoint was trained on other episodes, or on all of them.
     """
-    started, output = time.monotonic(), experiment.output
+    output, folder = experiment.output, Path(experiment.collect.folder)
     facts: dict[str, Any] = {**experiment.settings.chosen, "origin": asdict(experiment.origin)}
     fraction = _held_out(experiment, checkpoint)  # before an import
-    folder = Path(experiment.collect.folder)
     store = EpisodeStore(folder, experiment.collect.episodes) if is_store(folder) else demonstrations(experiment)
     if checkpoint is None:
         make_agent: Any = experiment.make_agent()
@@ -58,8 +55,6 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
         result = _measure(experiment, store, fraction, policy)
     finally:
         close_agent(policy)
-    seconds = time.monotonic() - started
-    facts["wall_time_s"] = wall_time(checkpoint, seconds) if checkpoint else seconds
     with writing(output / ERRORS):
         save_config(output, experiment.config, experiment.changes)
         with warn_on_error(output / ERRORS_PLOT):
@@ -67,9 +62,9 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
             plot_errors(result, output / ERRORS_PLOT)
         # Last, because its existence marks the evaluation as finished.
         write_errors(result, output / ERRORS, str(checkpoint) if checkpoint else None, experiment.config, facts)
-        page = None
-        with warn_on_error(output / PAGE):
-            page = write_page(output)
+    page = None
+    with warn_on_error(output / PAGE):
+        page = write_page(output)
     show(errors_table(components(result), len(result.seeds)))
     files = described([page, output / ERRORS, output / ERRORS_PLOT])
     log.info("wrote %s: open-loop errors, which are not a success rate", files)
@@ -84,12 +79,10 @@ def _held_out(experiment: Experiment, checkpoint: Path | None) -> float:
         trained, world = saved.spec.without_truth, experiment.world().spec.without_truth
         trained.require(world, f"the checkpoint {checkpoint}", "the task, with the options given here,")
         fraction = at(saved.config, "data.validation_fraction", None)
-        if not isinstance(fraction, float | int):
-            raise UserError(f"{checkpoint} does not say which share of the episodes its training held out")
-    if not fraction:
+    if not isinstance(fraction, float | int) or not fraction:
         raise UserError(
-            f"data.validation_fraction=0: {whose} on all episodes, and errors on these say nothing about others: train "
-            "with a larger fraction"
+            f"data.validation_fraction={fraction}: {whose} on all episodes, and errors on these say nothing about "
+            "others: train with a larger fraction"
         )
     return fraction
 
@@ -112,19 +105,16 @@ def _require_trained_on(store: EpisodeStore, more: Sequence[str], checkpoint: Pa
 
 def _measure(experiment: Experiment, store: EpisodeStore, fraction: float, policy: Any) -> OpenLoop:
     """Return the errors on the held-out episodes; a UserError if there are none, or no others."""
-    unseen = [entry for entry in store.episodes if held_out(entry.recording, fraction)]
-    seen = [entry for entry in store.episodes if not held_out(entry.recording, fraction)]
-    if not unseen:
+    parts: dict[bool, list[Entry]] = {True: [], False: []}
+    for entry in store.episodes:
+        parts[held_out(entry.recording, fraction)].append(entry)
+    if not all(parts.values()):
         raise UserError(
-            f"data.validation_fraction={fraction} holds none of the {len(store.episodes)} episodes in {store.folder} "
-            "out of training: train with a larger fraction, or with more episodes"
-        )
-    if not seen:
-        raise UserError(
-            f"all {len(unseen)} episodes in {store.folder} are held out, so there is no constant action to compare "
-            "with: record more, or raise collect.episodes"
+            f"data.validation_fraction={fraction} holds {len(parts[True])} of the {len(store.episodes)} episodes in "
+            f"{store.folder} out of training, and there must be some of either kind: record more, or train with "
+            "another fraction"
         )
     actions = store.rows("action")
-    constant = np.concatenate([actions[entry.span] for entry in seen]).mean(0)
-    shown = unseen[: experiment.evaluate.episodes]
-    return open_loop(policy, store.spec, (episode_of(store, entry) for entry in track(shown, "evaluating")), constant)
+    constant = np.concatenate([actions[entry.span] for entry in parts[False]]).mean(0)
+    shown = track(parts[True][: experiment.evaluate.episodes], "evaluating")
+    return open_loop(policy, store.spec, (episode_of(store, entry) for entry in shown), constant)

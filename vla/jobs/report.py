@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+from itertools import combinations
 from pathlib import Path
 
 from vla.config.experiment import Experiment
 from vla.config.nodes import ReportedRuns
 from vla.io.printable import show
-from vla.reports.comparison import compare_runs, differences_table, read_runs, remarks, rows_of, secondary_differences
+from vla.reports.comparison import compare, difference_tables, read_runs, remarks, rows_of
 from vla.reports.comparison_page import COMPARISON, write_comparison
 
 log = logging.getLogger(__name__)
@@ -17,8 +18,8 @@ log = logging.getLogger(__name__)
 def run(experiment: Experiment) -> None:
     """Write `comparison.html`, and print how the runs differ."""
     runs = read_runs([Path(folder) for folder in experiment.options(ReportedRuns).runs])
-    compared = compare_runs(runs, experiment.evaluate.margin)
-    for table in (differences_table(compared), secondary_differences(compared)):
+    compared = compare(combinations(rows_of(runs), 2), experiment.evaluate.margin)
+    for table in difference_tables(compared):
         if table.rows:
             show(table)
     for remark, about in (found := remarks(runs, compared)).items():

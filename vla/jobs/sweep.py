@@ -16,7 +16,7 @@ from vla.io.printable import show
 
 
 class SweepTable(Callback):
-    """Writes `sweep.html`, `sweep.csv`, `sweep.md` and `sweep.png` after every cell."""
+    """Writes `sweep.html`, `sweep.md` and `sweep.png` after every cell."""
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Remove an earlier error of the cell."""

@@ -15,7 +15,6 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from vla.config.experiment import Experiment, training_policy
-from vla.config.packages import remember_trust
 from vla.data.datamodule import WindowDataModule
 from vla.data.episodes import EpisodeStore
 from vla.io.errors import UserError
@@ -28,7 +27,6 @@ from vla.models.tokenizers.tokenization_error import out_of_bounds, rounding
 from vla.parallel.limits import cores
 from vla.reports.observations import SHOWN, draw_samples
 from vla.reports.run_page import write_page
-from vla.rollouts.collect import collection_time
 from vla.runs.files import Training
 from vla.runs.folder import (
     CHECKPOINTS,
@@ -40,7 +38,7 @@ from vla.runs.folder import (
     save_config,
     save_training,
 )
-from vla.runs.resume import LENGTHS, first_process, training_lock, training_progress
+from vla.runs.resume import first_process, training_lock, training_progress
 from vla.training.checkpoints import GracefulStop
 from vla.training.closed_loop import ClosedLoop
 from vla.training.estimate import Estimate
@@ -59,18 +57,17 @@ def run(experiment: Experiment) -> None:
 def train(experiment: Experiment) -> Path | None:
     """Train, and return the folder of the policy that validation selects; None in all but the first process.
 
-    An unfinished training in the output folder is resumed; a finished one is kept.
-
-    Raises:
-        UserError: the output folder has another training, or this one cannot start.
+    An unfinished training in the output folder is resumed; a finished one is kept. There is a UserError if the output
+    folder has another training, or this one cannot start.
     """
     output = experiment.output
-    state = training_progress(output, experiment.config)
-    if state.chosen is not None:
-        return state.chosen if first_process() else None
+    last, chosen = training_progress(output, experiment.config)
+    if chosen is not None:
+        return chosen if first_process() else None
     quiet_lightning()
     graceful_stop, closed_loop = GracefulStop(output / CHECKPOINTS), _closed_loop(experiment)
-    _warn_of_endless(experiment)
+    if experiment.trainer["max_steps"] in (None, -1) and experiment["learner"]["schedule"] == "cosine":
+        log.warning("without trainer.max_steps learner.schedule=cosine has no end: the learning rate stays at its peak")
     with closed_loop or nullcontext(), training_lock(output / CHECKPOINTS):
         # Before collection, so that missing devices are reported early.
         callbacks = [
@@ -82,7 +79,7 @@ def train(experiment: Experiment) -> Path | None:
         trainer = make_trainer(experiment.config, output / CHECKPOINTS, *callbacks)
         if not trainer.is_global_zero:
             logging.getLogger("vla").setLevel(logging.WARNING)  # only the first process logs
-        _fit(experiment, state.resume_from, trainer, graceful_stop)
+        _fit(experiment, last, trainer, graceful_stop)
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()  # together: at their exit the others would wait for the first one
         if not trainer.is_global_zero:
@@ -110,7 +107,7 @@ def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_s
         restore_metrics(trainer, last)
     else:
         save_config(output, experiment.config, experiment.changes)  # also of a training that fails at its start
-    with writing(output), _reported(experiment, trainer, graceful_stop, learner, store, last is not None):
+    with writing(output), _reported(experiment, trainer, graceful_stop, learner, last is not None):
         try:
             with (
                 explain_memory_errors(experiment.config),
@@ -171,15 +168,6 @@ class _Begun(Callback):
             training = read_training(self._experiment.output)
             archive_evaluation(self._experiment.output, training.steps if training else 0)
             save_config(self._experiment.output, self._experiment.config, self._experiment.changes)
-            remember_trust(self._experiment.output)
-
-
-def _warn_of_endless(experiment: Experiment) -> None:
-    trainer = experiment.trainer
-    if all(trainer.get(name) in (None, -1) for name in LENGTHS):
-        log.info("trainer.max_steps=-1: training runs until interrupted; Ctrl-C saves and stops")
-    if trainer["max_steps"] in (None, -1) and experiment["learner"]["schedule"] == "cosine":
-        log.warning("without trainer.max_steps learner.schedule=cosine has no end: the learning rate stays at its peak")
 
 
 def _warn_of_tokenization(model: Model, stores: list[EpisodeStore]) -> None:
@@ -212,12 +200,7 @@ def _closed_loop(experiment: Experiment) -> ClosedLoop | None:
 
 @contextmanager
 def _reported(
-    experiment: Experiment,
-    trainer: Trainer,
-    graceful_stop: GracefulStop,
-    learner: Learner,
-    store: EpisodeStore,
-    resumed: bool,
+    experiment: Experiment, trainer: Trainer, graceful_stop: GracefulStop, learner: Learner, resumed: bool
 ) -> Iterator[None]:
     """Write the report page and the log summary however training ends, including the runs it resumed from."""
     output, before, ended = experiment.output, read_training(experiment.output), "done"
@@ -226,7 +209,6 @@ def _reported(
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
     start = f", starting from {origin}" if (origin := experiment.settings.pretrained) else ""
     log.info("training %s with %.2f M parameters%s", type(learner.model).__name__, parameters / 1e6, start)
-    collected = collection_time(store, experiment.collect.episodes)
     try:
         yield
     except BaseException as error:
@@ -237,7 +219,7 @@ def _reported(
         # to do, and does not start.
         if trainer.is_global_zero and (graceful_stop.started or before is None or ended == "done" != before.ended):
             size = parameters, trainer.global_step, round(graceful_stop.seconds, 1)
-            save_training(output, Training(*size, ended, collected and round(collected, 1), origins=origins))
+            save_training(output, Training(*size, ended, origins))
             with warn_on_error(output / PAGE):
                 write_page(output)
     log.info("trained %d steps in %.0f s", trainer.global_step, graceful_stop.seconds)

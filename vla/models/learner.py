@@ -14,6 +14,7 @@ from torch import Tensor, distributed, nn
 from torchmetrics import MeanMetric
 
 from vla.io.errors import UserError
+from vla.io.printable import readable
 from vla.io.types import Natural, NonNegative, Positive, Rate
 from vla.models.compile_cache import set_compile_cache
 from vla.models.fsdp import local_shard, shard, unsharded
@@ -22,7 +23,7 @@ from vla.models.lora import LoRA
 from vla.models.model import Model
 from vla.models.recomputation import recompute_layers
 from vla.models.trunk import evaluate_trunk, trunks
-from vla.spec import Spec, readable
+from vla.spec import Spec
 
 CHECK_FINITE_EVERY = 50  # steps
 NEVER = torch.iinfo(torch.int64).max  # first step with a non-finite loss, if there was none

@@ -150,11 +150,6 @@ def policy_folder(name: str | Path) -> Path:
     raise UserError(f"there is no policy '{path}': name a run, as in outputs/runs/…, its folder {POLICY}, or {HUB}…")
 
 
-def is_gone(name: str) -> bool:
-    """Return whether a policy that was here when a training began has been deleted since."""
-    return not name.startswith(HUB) and not Path(name).exists()
-
-
 @cache
 def _fetched(name: str) -> Path:
     """Return the folder of a policy on the hub, downloading what is not cached: a revision is looked up once."""

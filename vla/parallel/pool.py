@@ -51,7 +51,7 @@ class Cluster:
         with one_thread_each():
             if self.workers == 1:
                 with closing(make()) as worker:
-                    yield SerialPool(worker)
+                    yield _SerialPool(worker)
             else:
                 with ProcessPool(make, self.workers) as pool:
                     yield pool
@@ -60,7 +60,7 @@ class Cluster:
 THIS_PROCESS = Cluster(1, "beside")
 
 
-class SerialPool:
+class _SerialPool:
     """A pool of one worker in this process, whose futures compute their result when asked for it."""
 
     size = 1
@@ -68,16 +68,16 @@ class SerialPool:
     def __init__(self, worker: Worker) -> None:
         self._worker = worker
 
-    def submit(self, item: Any) -> LazyFuture:
+    def submit(self, item: Any) -> _LazyFuture:
         """Submit an item."""
-        return LazyFuture(self._worker, item)
+        return _LazyFuture(self._worker, item)
 
     def as_completed(self, pending: Iterable[Any]) -> Iterator[Any]:
         """Yield futures in their order."""
         return iter(pending)
 
 
-class LazyFuture:
+class _LazyFuture:
     """Future that computes its result on demand."""
 
     def __init__(self, worker: Worker, item: Any) -> None:
@@ -178,5 +178,5 @@ class ProcessPool:
         return self._own.process
 
 
-Pool = SerialPool | ProcessPool
-Future = LazyFuture | futures.Future[Any]
+Pool = _SerialPool | ProcessPool
+Future = _LazyFuture | futures.Future[Any]

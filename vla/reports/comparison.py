@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -13,32 +13,15 @@ from vla.config.nodes import conditions, with_changes
 from vla.io.errors import UserError
 from vla.reports.result_tables import secondary_table
 from vla.reports.tables import DIFFERENCE, Table, difference
-from vla.rollouts.comparison import (
-    Comparison,
-    compare_pairs,
-    compare_samples,
-    concluded,
-    concluded_secondary,
-    pairs_of,
-    secondary_of,
-)
+from vla.rollouts.comparison import SUCCESS, Comparison, compare_samples, compared_in, concluded
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.statistics import effective_episodes
 from vla.runs.folder import Run, require_run
 from vla.runs.sweep import SweepRow
 
-CASE = ("second", "minus first", "condition")  # heads of what was compared
-
-
-@dataclass(frozen=True)
-class RunComparison:
-    """Comparison of two rows under a condition, in success and in secondary metrics of episodes that both played."""
-
-    one: str
-    other: str
-    condition: str
-    found: Comparison
-    secondary: Mapping[str, Comparison] = field(default_factory=dict)  # milestone or field of `Motion` → the same
+# Names of the second row, of the first one, and condition → what is compared → comparison.
+Compared = Mapping[tuple[str, ...], Mapping[str, Comparison]]
+CASE = ("second", "minus first", "condition")
 
 
 def read_runs(folders: Sequence[Path]) -> dict[str, Run]:
@@ -59,17 +42,7 @@ def rows_of(runs: Mapping[str, Run]) -> list[SweepRow]:
     return [SweepRow({"run": name}, [run]) for name, run in runs.items()]
 
 
-def compare_runs(runs: Mapping[str, Run], margin: float) -> list[RunComparison]:
-    """Compare every two runs, see `compare`."""
-    return compare(combinations(rows_of(runs), 2), margin)
-
-
-def compare_rows(rows: Sequence[SweepRow], margin: float) -> list[RunComparison]:
-    """Compare every row of a sweep with the first one, see `compare`."""
-    return compare(((rows[0], other) for other in rows[1:]), margin)
-
-
-def compare(pairs: Iterable[tuple[SweepRow, SweepRow]], margin: float) -> list[RunComparison]:
+def compare(pairs: Iterable[tuple[SweepRow, SweepRow]], margin: float) -> Compared:
     """Compare pairs of rows under each condition, in which they played in the same world.
 
     Single trainings are compared on the episodes that both played, by paired tests and in secondary metrics; without
@@ -77,17 +50,15 @@ def compare(pairs: Iterable[tuple[SweepRow, SweepRow]], margin: float) -> list[R
     training condition are left out. Verdicts take all comparisons into account, those on secondary metrics separately;
     `margin`, 0…1, is how much less success counts as not worse.
     """
-    found = [
-        RunComparison(one.name, other.name, condition, *compared)
+    found: dict[tuple[str, ...], dict[str, Comparison]] = {
+        (other.name, one.name, condition): compared
         for one, other in pairs
         for condition in one.played
         if condition in other.played
         and not _repeats_training_condition((*one.runs, *other.runs), condition)
         and (compared := _compared(one, other, condition))
-    ]
-    verdicts = concluded({number: each.found for number, each in enumerate(found)}, margin)
-    secondary = concluded_secondary({number: each.secondary for number, each in enumerate(found)})
-    return [replace(each, found=verdicts[number], secondary=secondary[number]) for number, each in enumerate(found)]
+    }
+    return concluded(found, margin)
 
 
 def _repeats_training_condition(runs: Sequence[Run], condition: str) -> bool:
@@ -96,28 +67,28 @@ def _repeats_training_condition(runs: Sequence[Run], condition: str) -> bool:
     return all(changes is not None and with_changes(task, changes) == task for task, changes in tasks)
 
 
-def _compared(one: SweepRow, other: SweepRow, condition: str) -> tuple[Comparison, Mapping[str, Comparison]] | None:
-    """Compare two rows under a condition, see `compare`; None in different worlds, or in samples that stopped early."""
+def _compared(one: SweepRow, other: SweepRow, condition: str) -> dict[str, Comparison]:
+    """Compare two rows under a condition, see `compare`; empty in other worlds, or in samples that stopped early."""
     runs = one.runs[0], other.runs[0]
     reports = [run.reports[condition] for row in (one, other) for run in row.runs if condition in run.reports]
     anytime = any(report.anytime for report in reports)
     if len(one.runs) == len(other.runs) == 1 and (together := common_episodes(*runs, condition)):
-        return compare_pairs(pairs_of(together), anytime), secondary_of(together, anytime)
+        return compared_in(together, anytime)
     first, second = (_by_seed(run, condition) for run in runs)
     shared = first.keys() & second.keys()
     alike = all(first[seed][1] == second[seed][1] for seed in shared)  # of samples all must be of the same world
     alike = alike if shared else _scenes(runs[0], condition) == _scenes(runs[1], condition)
     if anytime or not (first and second and alike):
-        return None
+        return {}
     samples = [effective_episodes(row.played[condition]) for row in (one, other)]
     episodes = one.episodes[condition] + other.episodes[condition]
-    return replace(compare_samples(*samples[0], *samples[1]), episodes=episodes), {}
+    return {SUCCESS: replace(compare_samples(*samples[0], *samples[1]), episodes=episodes)}
 
 
-def remarks(runs: Mapping[str, Run], compared: Sequence[RunComparison] | None = None) -> dict[str, str]:
+def remarks(runs: Mapping[str, Run], compared: Compared | None = None) -> dict[str, str]:
     """Return remark → the runs, by name, that it is about; with comparisons also which pairs have none."""
-    found = {(each.one, each.other) for each in compared or ()}
-    pairs = [] if compared is None else [pair for pair in combinations(runs, 2) if pair not in found]
+    known = {(one, other) for other, one, _ in compared or ()}
+    pairs = [] if compared is None else [pair for pair in combinations(runs, 2) if pair not in known]
     versions: dict[str, dict[str, None]] = {}
     for library, version in (each for run in runs.values() if run.report for each in run.report.versions.items()):
         versions.setdefault(library, {})[version] = None
@@ -135,27 +106,19 @@ def remarks(runs: Mapping[str, Run], compared: Sequence[RunComparison] | None = 
     return {remark: ", ".join(about) for remark, about in told.items() if about}
 
 
-def differences_table(compared: Sequence[RunComparison]) -> Table:
-    """Tabulate comparisons of success."""
-    alone = ("only the first succeeds", "only the second succeeds")
-    rows = [
-        [
-            *(each.other, each.one, each.condition, str(each.found.episodes)),
-            *("" if count is None else str(count) for count in (each.found.only_first, each.found.only_second)),
-            *difference(each.found),
-        ]
-        for each in compared
-    ]
+def difference_tables(compared: Compared) -> list[Table]:
+    """Tabulate comparisons of success, and those of milestones and motion."""
+    alone, rows = ("only the first succeeds", "only the second succeeds"), []
+    for case, metrics in compared.items():
+        found = metrics[SUCCESS]
+        counts = ["" if count is None else str(count) for count in (found.only_first, found.only_second)]
+        rows.append([*case, str(found.episodes), *counts, *difference(found)])
     note = (
         "On the episodes that both played, and in how many of these one succeeded alone; without such numbers, on "
         "different episodes of the same world, or of several trainings."
     )
-    return Table((*CASE, "episodes", *alone, *DIFFERENCE), rows, "Differences in success", note, (*alone, "p"))
-
-
-def secondary_differences(compared: Sequence[RunComparison]) -> Table:
-    """Tabulate comparisons of milestones and motion."""
-    return secondary_table({(each.other, each.one, each.condition): each.secondary for each in compared}, CASE)
+    heads = (*CASE, "episodes", *alone, *DIFFERENCE)
+    return [Table(heads, rows, "Differences in success", note, (*alone, "p")), secondary_table(compared, CASE)]
 
 
 def common_episodes(one: Run, other: Run, condition: str) -> list[tuple[Result, Result]]:

@@ -13,13 +13,12 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 
 from vla.config.differences import ABSENT, at, differences
-from vla.reports.comparison import RunComparison, differences_table, secondary_differences
+from vla.reports.comparison import Compared, difference_tables
 from vla.reports.page import Section, render
 from vla.reports.pictures import COLOURS, Panels, error_bars, plot_rates, svgs
 from vla.reports.tables import Table, config_value, duration, links, percent, rate
 from vla.reports.training_curves import training_sections
-from vla.rollouts.moving_picture import read_moving_pictures
-from vla.rollouts.recordings import shown
+from vla.rollouts.recordings import pictured, shown
 from vla.runs.folder import PAGE, RECORDING, RECORDINGS, Run
 from vla.runs.sweep import DEMONSTRATIONS, SweepRow, conditions_of
 
@@ -29,7 +28,7 @@ FAILURES = 3  # moving pictures per run
 
 
 def write_comparison(
-    page: Path, title: str, rows: Sequence[SweepRow], compared: Sequence[RunComparison], remarks: Mapping[str, str]
+    page: Path, title: str, rows: Sequence[SweepRow], compared: Compared, remarks: Mapping[str, str]
 ) -> Path:
     """Write a page on rows and their comparisons, and return its path; a UserError if a moving picture is damaged.
 
@@ -44,8 +43,7 @@ def write_comparison(
         results_table(rows, page.parent),
         Section("Remarks", facts=remarks),
         Section("Success", panels=svgs(success_panels(rows)), lines=legend),
-        differences_table(compared),
-        secondary_differences(compared),
+        *difference_tables(compared),
         *training_sections([(colour, run.metrics) for _, colour, run in cells]),
         _config_differences(few),
         *(_failures(name, run) for name, run in few.items()),
@@ -68,11 +66,12 @@ def results_table(rows: Sequence[SweepRow], folder: Path | None = None) -> Table
 
 def _costs(row: SweepRow, seeds: bool) -> list[str]:
     run, training = row.runs[0], row.runs[0].training
+    latencies = [each.report.latency_ms for each in row.runs if each.report and each.report.latency_ms]
     logged = max((steps[-1] + 1 for steps, _ in run.metrics.values()), default=ABSENT)
     return [
         *([", ".join(map(percent, row.rates))] if seeds else []),
-        f"{row.parameters / 1e6:.2f}" if row.parameters else ABSENT,
-        f"{row.latency:.1f}" if row.latencies else ABSENT,
+        f"{run.parameters / 1e6:.2f}" if run.parameters else ABSENT,
+        f"{min(latencies):.1f}" if latencies else ABSENT,  # because other load on the machine only increases it
         str(training.steps if training else logged),
         duration(training.seconds) if training else ABSENT,
     ]
@@ -131,5 +130,7 @@ def _config_differences(runs: Mapping[str, Run]) -> Table:
 
 
 def _failures(name: str, run: Run) -> Section:
-    pictures = read_moving_pictures(run.folder / RECORDINGS)
-    return Section(f"Failures of {name}", rollouts=[(each, pictures[each]) for each in shown(pictures, FAILURES, 0)])
+    results = run.report.per_episode if run.report else []
+    pictures = pictured(results, run.folder / RECORDINGS)
+    moving = shown((each for each in results if each.seed in pictures), FAILURES, 0)
+    return Section(f"Failures of {name}", rollouts=[(each, pictures[each.seed]) for each in moving])

@@ -21,13 +21,12 @@ def write_report(
     config: Mapping[str, Any],
     facts: Mapping[str, Any] | None = None,
     conditions: Mapping[str, Report] | None = None,
-    compared: Mapping[str, Comparison] | None = None,
-    secondary: Mapping[str, Mapping[str, Comparison]] | None = None,
+    compared: Mapping[str, Mapping[str, Comparison]] | None = None,
 ) -> None:
     """Write the report of the first condition as JSON atomically, with the evaluated policy and the resolved config.
 
     `facts` are further entries, such as chosen options, parameters and latency. `conditions` have other reports on the
-    same seeds, `compared` and `secondary` their comparisons with the first, in success and in milestones and motion.
+    same seeds, `compared` their comparisons with the first.
     """
     content = {
         **summary(report),
@@ -37,8 +36,7 @@ def write_report(
         "conditions": {
             name: {
                 **summary(other),
-                "comparison": asdict(compared[name]) if compared else None,
-                "secondary": {key: asdict(each) for key, each in (secondary or {}).get(name, {}).items()},
+                "compared": {key: asdict(each) for key, each in (compared or {}).get(name, {}).items()},
                 "outcomes": [result.outcome for result in other.results],
                 "reached": [result.milestones for result in other.results],
                 "motions": [result.motion and asdict(result.motion) for result in other.results],
@@ -51,9 +49,8 @@ def write_report(
     write_json(path, content)
 
 
-def summary(report: Report, of_tier: bool = False) -> dict[str, Any]:
-    """Summarise a report for JSON: rates with intervals, outcomes, milestones, motion, and the same per task if there
-    are several, and per tier; of several instructions per episode also how many were completed in a row."""
+def summary(report: Report) -> dict[str, Any]:
+    """Summarise a report for JSON: rates with intervals, outcomes and motion."""
     low, high = report.interval
     found: dict[str, Any] = {
         "success": report.success,
@@ -63,23 +60,15 @@ def summary(report: Report, of_tier: bool = False) -> dict[str, Any]:
         "successes": report.successes,
         "errors": len(report.errors),
         "outcome_counts": report.outcome_counts,
-        "milestones": {name: _share(report, count) for name, count in report.milestones.items()},
         "motion": {name: asdict(median) for name, median in report.medians.items()},
-        "tasks": {task: summary(part) for task, part in report.by_task.items()},
+        "anytime": report.anytime,
     }
-    if mean := report.mean_in_a_row:
-        found["in_a_row"] = {name: _share(report, count) for name, count in report.in_a_row.items()}
-        found["mean_in_a_row"] = dict(zip(("number", "ci_low", "ci_high"), mean, strict=True))
-    if not of_tier and report.by_tier:
-        found["tiers"] = {tier: summary(part, True) for tier, part in report.by_tier.items()}
-    if mean := report.mean_over_tiers:
-        found["mean_over_tiers"] = dict(zip(("rate", "ci_low", "ci_high"), mean, strict=True))
-    return found | ({"anytime": True} if report.anytime else {})
-
-
-def _share(report: Report, count: int) -> dict[str, Any]:
-    low, high = report.interval_of(count)
-    return {"rate": count / max(report.episodes, 1), "ci_low": low, "ci_high": high, "episodes": count}
+    for kind, rates in report.rates.items():
+        found[kind] = {name: {"rate": each.rate, **each._asdict()} for name, each in rates.items()}
+    for name, mean in (("mean_in_a_row", report.mean_in_a_row), ("mean_over_tiers", report.mean_over_tiers)):
+        if mean:
+            found[name] = dict(zip(("mean", "ci_low", "ci_high"), mean, strict=True))
+    return found
 
 
 def plot_report(report: Report, path: Path) -> None:

@@ -12,9 +12,10 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 
 from vla.data.episode_filter import flat, leaves
+from vla.io.printable import readable
 from vla.reports.pictures import GREEN, MIDDLE, Panels, plot_image, save
 from vla.reports.tables import Table
-from vla.spec import Array, Observation, Spec, readable
+from vla.spec import Array, Observation, Spec
 
 SHOWN = 6  # windows of the first training batch
 
@@ -27,26 +28,16 @@ def save_contact_sheet(seeds: Sequence[int], observations: Sequence[Observation]
 def reset_panels(seeds: Sequence[int], observations: Sequence[Observation]) -> Panels:
     """Return a panel per episode: the colour image of every camera, then its depth image, from near (blue) to far (red)
     in one range for all episodes, and without returns black."""
-    ranges = {name: _depth_range([each.depth[name] for each in observations]) for name in observations[0].depth}
     panels: Panels = {}
     for seed, seen in zip(seeds, observations, strict=True):
-        depth = [_coloured(seen.depth[name], *ends) for name, ends in ranges.items()]
-        image = np.concatenate([*seen.rgb.values(), *depth], axis=1)
-        panels[f"seed {seed}: {seen.instruction}"] = partial(plot_image, image=image)
+        images = [*seen.rgb.values()]
+        for name, depth in seen.depth.items():
+            everything = np.stack([each.depth[name] for each in observations])  # [mm]
+            low, high = np.percentile(everything[everything > 0], (1, 90)) if everything.any() else (0.0, 1.0)
+            shades = np.clip((depth - low) / max(high - low, 1.0), 0, 1)
+            images.append((255 * colormaps["turbo"](shades)[..., :3]).astype(np.uint8))
+        panels[f"seed {seed}: {seen.instruction}"] = partial(plot_image, image=np.concatenate(images, axis=1))
     return panels
-
-
-def _coloured(depth: Array, low: float, high: float) -> Array:
-    """Return the colours (H, W, 3) of depths (H, W) [mm]."""
-    colours = colormaps["turbo"](np.clip((depth - low) / (high - low), 0, 1))[..., :3]
-    return (255 * colours).astype(np.uint8)
-
-
-def _depth_range(images: Sequence[Array]) -> tuple[float, float]:
-    """Return a near and a far percentile [mm] of the pixels with a return."""
-    depth = np.stack(images)
-    low, high = np.percentile(depth[depth > 0], (1, 90)) if depth.any() else (0.0, 1.0)
-    return float(low), float(max(high, low + 1.0))
 
 
 def draws_table(seeds: Sequence[int], draws: Sequence[Mapping[str, Any]]) -> Table:

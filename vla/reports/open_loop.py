@@ -12,11 +12,16 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from vla.io.files import write_json
+from vla.io.printable import readable
 from vla.reports.pictures import BLUE, GREEN, GREY, MIDDLE, Panels, save
-from vla.reports.tables import Table
+from vla.reports.tables import Table, in_brackets
 from vla.rollouts.open_loop import OpenLoop
 from vla.runs.files import ComponentError
-from vla.spec import in_brackets
+
+NOTE = (
+    "Open loop: actions have no effect on what is seen next, so the errors tell how well the policy imitates the "
+    "recordings, not how often it succeeds. The constant action is the mean of the training episodes."
+)
 
 
 def components(result: OpenLoop) -> list[ComponentError]:
@@ -33,7 +38,7 @@ def write_errors(
     result: OpenLoop, path: Path, checkpoint: str | None, config: Mapping[str, Any], facts: Mapping[str, Any]
 ) -> None:
     """Write the errors as JSON atomically, in the units of the spec, with `facts` such as parameters and latency."""
-    per_episode = zip(result.seeds, result.recorded, result.errors.tolist(), strict=True)
+    episodes = zip(result.seeds, result.recorded, result.errors.tolist(), strict=True)
     content = {
         "seeds": result.seeds,
         "components": [asdict(each) for each in components(result)],
@@ -41,20 +46,21 @@ def write_errors(
         "checkpoint": checkpoint,
         **facts,
         "config": config,
-        "per_episode": [{"seed": seed, "steps": len(steps), "errors": errors} for seed, steps, errors in per_episode],
+        "per_episode": [{"seed": seed, "steps": len(steps), "errors": errors} for seed, steps, errors in episodes],
     }
     write_json(path, content)
 
 
 def errors_table(errors: Sequence[ComponentError], episodes: int) -> Table:
     """Tabulate the errors over so many episodes with their intervals, in readable units."""
-    rows = [[each.name, *each.readable()] for each in errors]
-    note = (
-        "Open loop: actions have no effect on what is seen next, so the errors tell how well the policy imitates the "
-        "recordings, not how often it succeeds. The constant action is the mean of the training episodes."
-    )
+    rows = []
+    for each in errors:
+        factor, unit = readable(each.unit)
+        error, low, still = (f"{factor * value:.3g}" for value in (each.error, each.ci_low, each.constant))
+        high = "∞" if each.ci_high is None else f"{factor * each.ci_high:.3g}"
+        rows.append([each.name, unit, error, f"{low}-{high}", still])
     heads = ("component", "unit", "error", "95 % CI", "of a constant action")
-    return Table(heads, rows, f"Mean absolute errors on {episodes} held-out episodes", note)
+    return Table(heads, rows, f"Mean absolute errors on {episodes} held-out episodes", NOTE)
 
 
 def plot_errors(result: OpenLoop, path: Path) -> None:
@@ -69,8 +75,8 @@ def plot_errors(result: OpenLoop, path: Path) -> None:
 
 
 def _plot_relative(axes: Axes, result: OpenLoop) -> None:
-    places, scale = np.arange(len(result.spec.action)), result.scale
-    error, low, high = (each / scale for each in (result.mean, *result.interval))
+    places = np.arange(len(result.spec.action))
+    error, low, high = (each / result.scale for each in (result.mean, *result.interval))
     axes.barh(places, error, color=GREEN, height=0.6)
     if np.isfinite(high).all():
         axes.errorbar(error, places, xerr=[error - low, high - error], fmt="none", ecolor=GREY, capsize=3)

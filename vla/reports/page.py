@@ -12,9 +12,11 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from vla.io.documents import read_bounded
 from vla.io.files import write_text
 from vla.reports.tables import Table, in_words
-from vla.rollouts.moving_picture import Caption
+from vla.rollouts.moving_picture import LARGEST
+from vla.rollouts.results import Result
 
 WILSON = "Wilson's; those of several trainings account for correlation within trainings and within scenes"
 ANYTIME = "anytime-valid, by betting, because playing stopped as soon as it was clear"
@@ -35,7 +37,7 @@ class Section:
     facts: Mapping[str, str] = field(default_factory=dict)  # name → text or markup
     panels: Mapping[str, Markup] = field(default_factory=dict)  # title → SVG
     lines: Mapping[str, str] = field(default_factory=dict)  # name → colour in the panels
-    rollouts: Sequence[tuple[Caption, Path]] = ()
+    rollouts: Sequence[tuple[Result, Path]] = ()
     picture: Path | None = None
 
     @property
@@ -47,7 +49,7 @@ class Section:
 def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bool = False, **content: Any) -> Path:
     """Write a page of the parts that are not empty, atomically, and return its path.
 
-    Of a run `content` has `subtitle`, `warning`, the large `rate` and what it is `of`, and the `entry` of an index.
+    Of a run `content` has `subtitle`, `warning`, the large `rate` and what it is `of`.
     With `anytime` the results are valid whatever the reason to stop playing.
     """
     loader = FileSystemLoader(Path(__file__).parent)
@@ -55,7 +57,7 @@ def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bo
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(embedded=_embedded, in_words=in_words)
-    content = dict.fromkeys(("subtitle", "warning", "rate", "of", "entry"), "") | content
+    content = dict.fromkeys(("subtitle", "warning", "rate", "of"), "") | content
     text = environment.get_template("page.html").render(
         title=title,
         parts=[part for part in parts if part.rows],
@@ -69,4 +71,4 @@ def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bo
 
 def _embedded(picture: Path) -> str:
     """Return a picture as a data URL."""
-    return f"data:image/{picture.suffix[1:]};base64,{b64encode(picture.read_bytes()).decode()}"
+    return f"data:image/{picture.suffix[1:]};base64,{b64encode(read_bounded(picture, LARGEST)).decode()}"

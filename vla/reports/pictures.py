@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import io
-import logging
 import math
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -19,13 +17,10 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.font_manager import FontProperties, findfont, findSystemFonts, fontManager, get_font
-from matplotlib.text import Text
+from matplotlib.font_manager import fontManager
 
 from vla.io.files import atomic_path
 from vla.spec import Array
-
-log = logging.getLogger(__name__)
 
 Interval = tuple[float, float, float]  # success rate and its 95 % confidence interval
 Panels = dict[str, Callable[[Axes], object]]  # title → what draws the rest
@@ -79,12 +74,20 @@ def plot_image(axes: Axes, image: Array) -> None:
 @contextmanager
 def _style(ink: str = INK) -> Iterator[None]:
     """Style of everything that is drawn."""
-    settings: Any = {"text.parse_math": False, "font.size": 9, "axes.titlesize": 9, "axes.linewidth": 0.6}
+    # Fonts of the machine for characters that matplotlib's own lacks, such as those of fonts-noto-cjk.
+    families = ["DejaVu Sans", *sorted({font.name for font in fontManager.ttflist if "CJK" in font.name})]
+    settings: Any = {
+        "font.family": families,
+        "text.parse_math": False,
+        "font.size": 9,
+        "axes.titlesize": 9,
+        "axes.linewidth": 0.6,
+    }
     settings |= {f"axes.spines.{side}": False for side in ("top", "right")} | {"svg.fonttype": "none"}
     settings |= {f"{part}.color": ink for part in ("text", "xtick", "ytick", "grid")}
     settings |= {f"axes.{part}": ink for part in ("edgecolor", "labelcolor", "titlecolor")}
     with matplotlib.rc_context(settings), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", r"Glyph \d+ .*missing from")  # `use_fonts` says it once, browsers have more
+        warnings.filterwarnings("ignore", r"Glyph \d+ .*missing from")  # browsers have more fonts
         yield
 
 
@@ -104,7 +107,6 @@ def save(
             axes = figure.add_subplot(rows, columns, number + 1)
             axes.set_title(fill(name, int(14 * size[0])))
             draw(axes)
-        use_fonts(figure)
         with atomic_path(path) as draft:
             figure.savefig(draft, format="png", dpi=110, transparent=ink != INK)
 
@@ -128,36 +130,3 @@ def _svg(title: str, draw: Callable[[Axes], object]) -> Markup:
     svg = file.getvalue()
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
     return Markup(re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg).replace(INK, "currentColor"))
-
-
-def use_fonts(figure: Figure) -> None:
-    """Let the texts of a figure fall back on fonts of the machine; one sentence says if none has a character."""
-    texts = [text for text in figure.findobj(Text) if isinstance(text, Text)]
-    families = families_with(frozenset(each for text in texts for each in text.get_text() if ord(each) > 0x24F))
-    for text in texts if families else ():
-        text.set_fontfamily([*text.get_fontfamily(), *families])
-
-
-@cache
-def families_with(characters: frozenset[str]) -> list[str]:
-    """Return the families of as few fonts as have the characters together: matplotlib's own, then the best one."""
-    files = (findfont(FontProperties()), *sorted(findSystemFonts(), key=lambda file: ("Regular" not in file, file)))
-    fonts, missing, found = {file: _within(file, characters) for file in files if characters}, characters, list[str]()
-    while missing and fonts[best := max(fonts, key=lambda file: len(fonts[file] & missing))] & missing:
-        fontManager.addfont(best)  # its own list may be older
-        found.append(get_font(best).family_name)
-        missing -= fonts[best]
-    if missing:
-        log.warning(
-            "no font of this machine has some of the characters to be drawn, so pictures show boxes in their place: "
-            "install one, such as the package fonts-noto-cjk for Chinese, Japanese and Korean"
-        )
-    return found
-
-
-def _within(file: str, characters: frozenset[str]) -> frozenset[str]:
-    """Return which of the characters a font has; none of what cannot be read."""
-    try:
-        return frozenset(each for each in characters if get_font(file).get_char_index(ord(each)))
-    except (OSError, RuntimeError):
-        return frozenset()

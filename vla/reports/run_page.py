@@ -6,17 +6,14 @@ from pathlib import Path
 
 from vla.config.differences import ABSENT, at
 from vla.data.index import listed
-from vla.io.files import warn_on_error
 from vla.reports.factors import episode_panels
-from vla.reports.index import INDEX, RUNS, entry, write_index
 from vla.reports.open_loop import errors_table
 from vla.reports.page import Section, render
 from vla.reports.pictures import GREEN, svgs
-from vla.reports.result_tables import conditions_table, rate_tables, rounds_table, secondary_table
-from vla.reports.tables import Table, config_value, duration, in_words, links, percent, rate
+from vla.reports.result_tables import conditions_table, rate_tables, secondary_table
+from vla.reports.tables import Table, config_value, duration, in_words, links, percent
 from vla.reports.training_curves import training_sections
-from vla.rollouts.moving_picture import read_moving_pictures
-from vla.rollouts.recordings import shown
+from vla.rollouts.recordings import pictured, shown
 from vla.rollouts.results import ERROR
 from vla.runs.folder import ERRORS_PLOT, PAGE, RECORDING, RECORDINGS, SAMPLES, Run, read_run
 from vla.spec import IN_DISTRIBUTION
@@ -32,12 +29,12 @@ WINDOWS = "The newest images of each window, its instruction, and each component
 def write_page(folder: Path) -> Path:
     """Write the page of a run from the files in its folder, and return its path; missing files are omitted.
 
-    In a folder named `runs` the list of them is written again. Raises a UserError if a file is damaged.
+    Raises a UserError if a file is damaged.
     """
     run = read_run(folder)
     report = run.reports.get(IN_DISTRIBUTION)
     others = run.report.conditions if run.report else {}
-    compared = {name: part.comparison for name, part in others.items() if part.comparison}
+    compared = {name: part.compared for name, part in others.items()}
     changes = [[each.key, config_value(each.here), config_value(each.default)] for each in run.changes or ()]
     parts = [
         Section("", facts=_facts(run)),
@@ -46,32 +43,24 @@ def write_page(folder: Path) -> Path:
         _rollouts(run),
         Section("Episodes", EPISODES, panels=svgs(episode_panels(report)) if report else {}),
         *([conditions_table(run.reports, compared)] if others else []),
-        secondary_table({(name,): part.secondary for name, part in others.items()}, ["condition"]),
+        secondary_table({(name,): found for name, found in compared.items()}),
         *(rate_tables(report) if report else ()),
         *training_sections([(GREEN, run.metrics)]),
-        rounds_table(run.report.rounds if run.report else ()),
         Section("First training batch", WINDOWS, picture=folder / SAMPLES),
         *_origins(run),
         Table(("key", "here", "default"), changes, "Differences from the default configuration"),
     ]
-    title, (ended, warning) = folder.resolve().name, _ended(run)
-    interval = rate((report.success, *report.interval)) if report else ""
-    page = render(
+    title = folder.resolve().name
+    return render(
         folder / PAGE,
         " · ".join(filter(None, (run.policy, _tasks(run)))) or title,
         parts,
         any(each.anytime for each in run.reports.values()),
         subtitle=title,
-        warning=warning,
+        warning=_ended(run),
         rate=f"{percent(report.success)} %" if report else "",
         of=str(report).splitlines()[-1] if report else "",
-        entry=entry(run.policy, _tasks(run), interval, str(report.episodes) if report else "", ended),
     )
-    runs = folder.resolve().parent
-    if runs.name == RUNS:
-        with warn_on_error(runs / INDEX):
-            write_index(runs)
-    return page
 
 
 def _tasks(run: Run) -> str:
@@ -81,14 +70,13 @@ def _tasks(run: Run) -> str:
     return ", ".join(tasks) if len(tasks) <= NAMED else f"{len(tasks)} tasks"
 
 
-def _ended(run: Run) -> tuple[str, str]:
-    """Return how a training ended that was not completed, in a word and in a sentence."""
+def _ended(run: Run) -> str:
+    """Return how a training ended that was not completed, in a sentence."""
     if not run.training or run.training.ended == "done":
-        return "", ""
+        return ""
     if run.training.ended != "interrupted":
-        return "failed", f"Training failed: {run.training.ended}"
-    after = f"Training was interrupted after {run.training.steps} steps"
-    return "interrupted", f"{after}; resume={_near(run.folder)} continues it."
+        return f"Training failed: {run.training.ended}"
+    return f"Training was interrupted after {run.training.steps} steps; resume={_near(run.folder)} continues it."
 
 
 def _near(path: Path, *folders: Path) -> Path:
@@ -109,9 +97,6 @@ def _facts(run: Run) -> dict[str, str]:
         facts["time per action"] = f"{report.latency_ms:.1f} ms"
     if training:
         facts["training"] = f"{training.steps} steps in {duration(training.seconds)}"
-    if report and report.wall_time_s:
-        of_another = "evaluation, and training of the policy" if report.checkpoint else "evaluation"
-        facts["collection, training, evaluation" if training else of_another] = duration(report.wall_time_s)
     if run.metrics and (demonstrations := at(run.config, "collect.episodes")) != ABSENT:
         facts["demonstrations"] = str(demonstrations)
     if report and report.seeds:
@@ -124,9 +109,10 @@ def _facts(run: Run) -> dict[str, str]:
 
 def _rollouts(run: Run) -> Section:
     """Return the moving pictures, what the recording has, and how to play an episode again."""
-    pictures, facts = read_moving_pictures(run.folder / RECORDINGS), dict[str, str]()
+    results = [each for each in run.report.per_episode if each.outcome != ERROR] if run.report else []
+    pictures, facts = pictured(results, run.folder / RECORDINGS), dict[str, str]()
     if (run.folder / RECORDING).is_file() and run.report:
-        results, recorded = [each for each in run.report.per_episode if each.outcome != ERROR], {*run.report.recorded}
+        recorded = {*run.report.recorded}
         counts = [
             f"{sum(each.seed in recorded for each in played)} of {len(played)} {name}"
             for name, good in (("failures", False), ("successes", True))
@@ -135,7 +121,8 @@ def _rollouts(run: Run) -> Section:
         facts["recording"] = links({RECORDING: RECORDING}) + f" has {' and '.join(counts)}; rerun {RECORDING} plays it"
         policy = f"checkpoint={_near(Path(run.report.checkpoint))} " if run.report.checkpoint else ""
         facts["another one"] = f"{policy}evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
-    return Section("Rollouts", ROLLOUTS, facts, rollouts=[(caption, pictures[caption]) for caption in shown(pictures)])
+    moving = shown(each for each in results if each.seed in pictures)
+    return Section("Rollouts", ROLLOUTS, facts, rollouts=[(each, pictures[each.seed]) for each in moving])
 
 
 def _origins(run: Run) -> list[Section]:

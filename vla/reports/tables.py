@@ -92,6 +92,11 @@ def in_words(name: str) -> str:
     return name.replace("_", " ")
 
 
+def in_brackets(unit: str) -> str:
+    """Format a unit for the title of a plot, as " [m]"; "" for none."""
+    return "" if unit == "1" else f" [{unit}]"
+
+
 def duration(seconds: float) -> str:
     """Return a duration [s] in words."""
     minutes, rest = divmod(round(seconds), 60)

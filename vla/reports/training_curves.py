@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,12 +18,7 @@ PACE = "pace/"  # prefix of the metrics of the speed
 NOTE = "Against training steps; thin lines: training, thick lines: validation."
 
 
-class Line(NamedTuple):
-    """Curve in a panel."""
-
-    training: bool  # logged in training, not in validation
-    colour: str
-    curve: Curve
+Line = tuple[bool, str, Curve]  # whether it was logged in training, not in validation; colour; curve
 
 
 def training_sections(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> list[Section]:
@@ -36,10 +30,10 @@ def training_sections(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> list[S
     for colour, metrics in runs:
         for name, curve in metrics.items():
             part = parts["Speed of the training" if name.startswith(PACE) else "Training"]
-            part.setdefault(_title(name), []).append(Line(not name.startswith("val/"), colour, curve))
+            part.setdefault(_title(name), []).append((not name.startswith("val/"), colour, curve))
     sections = []
     for heading, panels in parts.items():
-        ordered = sorted(panels, key=lambda title: (all(line.training for line in panels[title]), title != "loss"))
+        ordered = sorted(panels, key=lambda title: (all(training for training, _, _ in panels[title]), title != "loss"))
         drawn = svgs({title: partial(_plot, title=title, lines=panels[title]) for title in ordered})
         sections.append(Section(heading, NOTE, panels=drawn))
     return sections
@@ -70,6 +64,6 @@ def _plot(axes: Axes, title: str, lines: Sequence[Line]) -> None:
 
 
 def _spans_decades(lines: Sequence[Line]) -> bool:
-    values = np.concatenate([line.curve[1] for line in lines])
+    values = np.concatenate([values for _, _, (_, values) in lines])
     values = values[np.isfinite(values)]
     return bool(len(values) and values.min() > 0 and values.max() > DECADE * values.min())

@@ -11,21 +11,16 @@ import logging
 import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import Annotated, cast
 
 import numpy as np
-from annotated_types import Ge, Le
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vla.data.episodes import EpisodeStore
 from vla.data.index import DAMAGED, NOT_NEEDED
-from vla.io.documents import read_json
 from vla.io.errors import UserError
-from vla.io.files import write_text
 from vla.parallel.pool import Cluster, Future, Pool, WorkersLost
 from vla.parallel.processes import WorkerFactory
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, close_agent, replay, rollout
@@ -33,8 +28,6 @@ from vla.spec import FIRST_SEED, Episode, Multitask
 
 log = logging.getLogger(__name__)
 
-COLLECTION_TIME = "seconds.txt"  # file in a store: total duration of its collection [s]
-Seconds = Annotated[float, Ge(0), Le(1e9)]
 MAX_FAILURES = 50  # consecutive failures at a task before collection is given up
 LOOK_AHEAD = 4  # pending episodes per worker: a long one must not block the others
 NOT_REPEATABLE = "not_repeatable"  # outcome of a success that the replay of its actions does not reproduce
@@ -80,54 +73,21 @@ def collect(
     """Roll the expert out on `seed`, `seed` + 1, … until the store holds `episodes` successes.
 
     Existing episodes are kept. If another process is collecting into the same store, wait for it. Each process of
-    `cluster` calls the two factories once. `multitask` tells the task of a seed; its
-    tasks get equal shares. With `keep_failures` every seed gives an episode: failures are stored and count too.
-
-    Raises:
-        UserError: the store starts at another seed or is derived, the expert fails persistently, workers died, or the
-            disk is full.
+    `cluster` calls the two factories once. `multitask` tells the task of a seed; its tasks get equal shares. With
+    `keep_failures` every seed gives an episode: failures are stored and count too. There is a UserError if the store
+    starts at another seed or is derived, the expert fails persistently, workers died, or the disk is full.
     """
     started, before = time.monotonic(), len(store.episodes)
     store.require_first_seed(seed)
     if before < episodes:
         store.require_growable()
         with store.writing():  # once another process has finished, which may have added some
-            before, began = len(store.episodes), time.monotonic()
+            before = len(store.episodes)
             store.require_first_seed(seed)
             if before < episodes:
                 make = partial(DemonstrationWorker, make_environment, make_expert, keep_failures)
-                try:
-                    _fill_with(cluster, make, store, partial(_fill, store, episodes, seed, multitask, keep_failures))
-                finally:
-                    _save_collection_time(store.folder, time.monotonic() - began)
+                _fill_with(cluster, make, store, partial(_fill, store, episodes, seed, multitask, keep_failures))
     return Summary.of(store, len(store.episodes) - before, time.monotonic() - started)
-
-
-def collection_time(store: EpisodeStore, episodes: int) -> float | None:
-    """Return the time that it took to collect `episodes` of a store [s]; None if it is unknown.
-
-    The time of killed processes is not included.
-    """
-    seconds = _saved_time(store.folder / COLLECTION_TIME)
-    return seconds and seconds * episodes / len(EpisodeStore(store.folder).episodes)
-
-
-def _saved_time(file: Path) -> float | None:
-    """Return the duration in a file [s]; None, with a warning, for a damaged file: it only informs."""
-    try:
-        return read_json(file, cast(type[float], Seconds), largest=100) if file.exists() else None
-    except (OSError, ValueError) as error:
-        log.warning("the duration of the collection is unknown: %s", error)
-        return None
-
-
-def _save_collection_time(folder: Path, seconds: float) -> None:
-    """Add to the saved time, unless that is unknown; ignored on a full disk, which the store reports."""
-    file = folder / COLLECTION_TIME
-    before = _saved_time(file) if file.exists() else 0.0
-    if before is not None:
-        with suppress(OSError):
-            write_text(file, f"{before + seconds:.1f}\n")
 
 
 def _fill_with(cluster: Cluster, make: WorkerFactory, store: EpisodeStore, fill: Callable[[Pool], None]) -> None:
@@ -143,7 +103,7 @@ def _fill_with(cluster: Cluster, make: WorkerFactory, store: EpisodeStore, fill:
             log.warning("workers were lost after %d episodes; continuing with new ones", len(store.episodes))
 
 
-class Attempts:
+class _Attempts:
     """Episodes in the order of their seeds.
 
     They are rolled out in advance for tasks that would need more even if all pending episodes succeed.
@@ -208,7 +168,7 @@ def _fill(
     store: EpisodeStore, episodes: int, seed: int, multitask: Multitask | None, keep_failures: bool, pool: Pool
 ) -> None:
     """Append episodes until there are so many, or the expert fails too often in a row."""
-    before, attempts, started = len(store.episodes), Attempts(pool, multitask, store, seed), time.monotonic()
+    before, attempts, started = len(store.episodes), _Attempts(pool, multitask, store, seed), time.monotonic()
     outcomes = Counter(entry.success for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED))
     in_a_row = defaultdict[str, list[str]](list)  # task → outcomes of the failures since its last success
     columns = (TextColumn("collecting"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))

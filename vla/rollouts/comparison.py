@@ -20,20 +20,23 @@ from vla.spec import Array
 
 Key = TypeVar("Key")
 Amounts = Sequence[float] | Array
+Together = Sequence[tuple[Result, Result]]  # of two policies, or of one under two conditions, in the same episodes
+
+SUCCESS = "success"  # what is compared first; the others are fields of `Motion`, and milestones
 
 
 class Pairs(NamedTuple):
-    """Numbers of episodes with the same seed, by the outcomes of two policies, or of one under two conditions."""
+    """Numbers of pairs of episodes, by what happened in them."""
 
-    both: int  # succeeded
-    first: int  # succeeded alone
-    second: int  # succeeded alone
-    neither: int  # succeeded
+    both: int  # in both
+    first: int  # in the first alone
+    second: int
+    neither: int
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Second policy or condition minus the first: the success rate, or the median difference of an amount."""
+    """Second policy or condition minus the first: a rate, such as that of success, or the median of an amount."""
 
     difference: float  # a rate's is from -1 to 1
     ci_low: float  # of its 95 % confidence interval
@@ -51,12 +54,12 @@ class Comparison:
         Not worse than a margin means that the lower end of the interval is above it (the test of non-inferiority at
         2.5 %, not adjusted for the number of comparisons). Without a margin a difference is neither better nor worse.
         """
+        decided = p_holm <= LEVEL
         if margin is None:
             more = (self.only_second or 0) > (self.only_first or 0)  # the median may be 0
-            verdict = "open" if p_holm > LEVEL else "more" if more else "less"
-            return replace(self, p_holm=p_holm, verdict=verdict)
+            return replace(self, p_holm=p_holm, verdict="open" if not decided else "more" if more else "less")
         points, bounded = f"{100 * margin:g} points", self.ci_low > -margin
-        if p_holm > LEVEL:
+        if not decided:
             verdict = f"not worse by {points}" if bounded else "open"
         elif self.difference > 0:
             verdict = "better"
@@ -66,19 +69,15 @@ class Comparison:
 
 
 def compare_pairs(pairs: Pairs, anytime: bool = False) -> Comparison:
-    """Compare success in pairs of episodes: McNemar's exact test and Newcombe's interval.
+    """Compare rates in pairs of episodes: McNemar's exact test and Newcombe's interval.
 
     With `anytime` both are valid whatever the reason to stop playing, see `vla.rollouts.sequential`.
     """
+    _, first, second, _ = pairs
     played = sum(pairs)
-    difference = (pairs.second - pairs.first) / max(played, 1)
-    if anytime:
-        low, high = anytime_difference(pairs.first, pairs.second, played)
-        p = anytime_p(pairs.first, pairs.second)
-    else:
-        low, high = newcombe_paired(pairs)
-        p = mcnemar(pairs.first, pairs.second)
-    return Comparison(difference, low, high, p, played, pairs.first, pairs.second)
+    low, high = anytime_difference(first, second, played) if anytime else newcombe_paired(pairs)
+    p = (anytime_p if anytime else mcnemar)(first, second)
+    return Comparison((second - first) / max(played, 1), low, high, p, played, first, second)
 
 
 def compare_samples(won_first: float, first: float, won_second: float, second: float) -> Comparison:
@@ -104,25 +103,6 @@ def compare_amounts(first: Amounts, second: Amounts, anytime: bool = False) -> C
     less, more = int((differences < 0).sum()), int((differences > 0).sum())
     p = (anytime_p if anytime else mcnemar)(less, more)
     return Comparison(float(np.median(differences)), *interval, p, len(differences), less, more)
-
-
-def concluded(comparisons: Mapping[Key, Comparison], margin: float | None) -> dict[Key, Comparison]:
-    """Return the comparisons with verdicts that together find a false difference with a probability of at most 5 %.
-
-    S. Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6 (1979).
-    Pairs that never differ cannot give a small p-value, so they do not count (R. E. Tarone, "A modified Bonferroni
-    method for discrete data", Biometrics 46, 1990). The `margin` of non-inferiority, 0…1, is None if it is not about
-    success.
-    """
-    left = sum(
-        each.only_first is None or each.only_first + (each.only_second or 0) > 0 for each in comparisons.values()
-    )
-    found, largest = {}, 0.0
-    for key, each in sorted(comparisons.items(), key=lambda item: item[1].p):
-        largest = max(largest, min(1.0, max(left, 1) * each.p))
-        found[key] = each.conclude(largest, margin)
-        left -= 1
-    return {key: found[key] for key in comparisons}
 
 
 def fisher(won_first: int, first: int, won_second: int, second: int) -> float:
@@ -175,20 +155,15 @@ def pairs_of(
     return Pairs(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
 
 
-def secondary_of(together: Sequence[tuple[Result, Result]], anytime: bool) -> dict[str, Comparison]:
-    """Compare, in pairs of episodes, motion where both succeeded, and how often each milestone was reached in the same
-    task.
+def compared_in(together: Together, anytime: bool) -> dict[str, Comparison]:
+    """Compare pairs of episodes in success, in motion where both succeeded, and in milestones of the same task.
 
-    Returns:
-        Field of `Motion` or milestone → comparison, without fields of which too few pairs are known.
+    Returns `SUCCESS`, field of `Motion` or milestone → comparison, without fields of which too few pairs are known.
     """
-    found = {}
+    found = {SUCCESS: compare_pairs(pairs_of(together), anytime)}
+    motions = [(one.motion, two.motion) for one, two in together if one.success and two.success]
     for name in AMOUNTS:
-        pairs = [
-            (getattr(one.motion, name), getattr(two.motion, name))
-            for one, two in together
-            if one.success and two.success and one.motion and two.motion
-        ]
+        pairs = [(getattr(one, name, None), getattr(two, name, None)) for one, two in motions]
         known = np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
         if compared := compare_amounts(known[:, 0], known[:, 1], anytime):
             found[name] = compared
@@ -198,41 +173,38 @@ def secondary_of(together: Sequence[tuple[Result, Result]], anytime: bool) -> di
     return found
 
 
-def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str, Comparison]:
-    """Return condition → comparison of its success with that of the first condition, which has none.
+def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str, dict[str, Comparison]]:
+    """Return condition → its comparisons with the first condition, which has none, with verdicts.
 
     Pairs with an error do not count. Where episodes were played until it was clear, one report may be longer. The
-    `margin` of non-inferiority is a difference of rates, 0…1.
-
-    Raises:
-        UserError: the reports have different seeds.
+    `margin` of non-inferiority is a difference of rates, 0…1. A UserError tells that reports have different seeds.
     """
-    paired = _paired(reports)
-    return concluded({name: compare_pairs(pairs_of(both), anytime) for name, (both, anytime) in paired.items()}, margin)
-
-
-def compare_secondary_metrics(reports: Mapping[str, Report]) -> dict[str, dict[str, Comparison]]:
-    """Return condition → comparisons of milestones and motion with those of the first condition, which has none.
-
-    Verdicts take all of them into account, but not the comparisons of success. Raises as `compare_conditions` does.
-    """
-    return concluded_secondary({name: secondary_of(*paired) for name, paired in _paired(reports).items()})
-
-
-def _paired(reports: Mapping[str, Report]) -> dict[str, tuple[list[tuple[Result, Result]], bool]]:
-    """Return condition → its episodes beside those of the first one, and whether statements are valid at any time."""
     (_, first), *others = reports.items()
-    paired = {}
+    found = {}
     for name, other in others:
-        both, anytime = list(zip(first.results, other.results, strict=False)), first.anytime or other.anytime
-        if any(one.seed != two.seed for one, two in both) or (len(first.results) != len(other.results) and not anytime):
+        together, anytime = list(zip(first.results, other.results, strict=False)), first.anytime or other.anytime
+        longer = len(first.results) != len(other.results) and not anytime
+        if longer or any(one.seed != two.seed for one, two in together):
             raise UserError("only reports on the same seeds can be compared")
-        paired[name] = both, anytime
-    return paired
+        found[name] = compared_in(together, anytime)
+    return concluded(found, margin)
 
 
-def concluded_secondary(secondary: Mapping[Key, Mapping[str, Comparison]]) -> dict[Key, dict[str, Comparison]]:
-    """Return what `secondary_of` found in several cases, with verdicts that take all of it into account."""
-    flat = {(case, name): compared for case, metrics in secondary.items() for name, compared in metrics.items()}
-    found = concluded(flat, None)
-    return {case: {name: found[case, name] for name in metrics} for case, metrics in secondary.items()}
+def concluded(cases: Mapping[Key, Mapping[str, Comparison]], margin: float | None) -> dict[Key, dict[str, Comparison]]:
+    """Return the comparisons of all cases with verdicts: those in success take each other into account, so do others.
+
+    Together they find a false difference with a probability of at most 5 %: S. Holm, "A simple sequentially rejective
+    multiple test procedure", Scandinavian Journal of Statistics 6 (1979). Pairs that never differ cannot give a small
+    p-value, so they do not count (R. E. Tarone, "A modified Bonferroni method for discrete data", Biometrics 46, 1990).
+    """
+    every = [(case, name, each) for case, found in cases.items() for name, each in found.items()]
+    verdicts: dict[tuple[Key, str], Comparison] = {}
+    for of_success in (True, False):
+        family = [item for item in every if (item[1] == SUCCESS) == of_success]
+        left = sum(each.only_first is None or each.only_first + (each.only_second or 0) > 0 for _, _, each in family)
+        largest = 0.0
+        for case, name, each in sorted(family, key=lambda item: item[2].p):
+            largest = max(largest, min(1.0, max(left, 1) * each.p))
+            verdicts[case, name] = each.conclude(largest, margin if of_success else None)
+            left -= 1
+    return {case: {name: verdicts[case, name] for name in found} for case, found in cases.items()}

@@ -47,49 +47,51 @@ def evaluate(
 ) -> Report:
     """Play the episodes of the seeds; `name` is the label of the progress bar.
 
-    `recordings` says which episodes are recorded. Unless that is all, it is known at the end only which they are: these
-    are played once more and recorded.
-
-    Every process of the `cluster` calls the factories once. Errors of a factory end the
-    evaluation; errors of an episode, or a crash of its process, are reported in its result.
+    `recordings` says which are recorded. Unless that is all, it is known at the end only which they are: these are
+    played once more. Every process of the `cluster` calls the factories once; agents that are `vla.spec.Agents` act in
+    so many `lanes` side by side in each. Errors of a factory end the evaluation; errors of an episode, or a crash of
+    its process, are reported in its result.
 
     With `until` the evaluation stops as soon as `until(report on the first n seeds)` is true; n is a multiple of
     `turns`, the number of tasks if seeds cycle through tasks. Results of later seeds are discarded, so that the report
     does not depend on the number of workers.
 
     Episodes whose seeds are in `known`, seed → result, are not played again. `keep` is called with every other result
-    as soon as there is one, unless it is an error.
-
-    Agents that are `vla.spec.Agents` act in so many `lanes` side by side in every process.
-
-    Raises:
-        UserError: there are no seeds, seeds are in the range of collection, or the cluster raises one.
+    as soon as there is one, unless it is an error. There is a UserError if there are no seeds, seeds are in the range
+    of collection, or the cluster raises one.
     """
     if not seeds or min(seeds) < FIRST_SEED:
         raise UserError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
     make = partial(_RolloutWorker, make_environment, make_agent, None if recordings == 0 else make_recorder, lanes)
     at_once, score = recordings == "all", _Score(seeds, dict(known or {}), until, turns)
+    with cluster.pool(make) as pool:
+        _play_missing(pool, score, at_once, 1 if lanes == 1 else ROUNDS * lanes, name, keep or (lambda result: None))
+        report = score.report()
+        if make_recorder is not None and not at_once:
+            _record(pool, chosen(report, recordings))
+    return report
+
+
+def _play_missing(
+    pool: Pool, score: _Score, recorded: bool, size: int, name: str, keep: Callable[[Result], None]
+) -> None:
+    """Play what is missing in groups of `size`, until what counts suffices."""
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
-    with cluster.pool(make) as pool, Progress(*columns, TimeRemainingColumn()) as progress:
-        bar = progress.add_task("", total=len(seeds), completed=len(score.results))
-        missing = [] if score.clear() else [seed for seed in seeds if seed not in score.results]
-        size = 1 if lanes == 1 else ROUNDS * lanes
+    with Progress(*columns, TimeRemainingColumn()) as progress:
+        bar = progress.add_task("", total=len(score.seeds), completed=len(score.results))
+        missing = [] if score.clear() else [seed for seed in score.seeds if seed not in score.results]
         groups = [missing[first : first + size] for first in range(0, len(missing), size)]
-        group_of = {pool.submit((group, at_once)): group for group in groups}
+        group_of = {pool.submit((group, recorded)): group for group in groups}
         for future in pool.as_completed(group_of):
-            for result in _results(pool, future, group_of[future], at_once):
+            for result in _results(pool, future, group_of[future], recorded):
                 score.results[result.seed] = result
-                if keep is not None and result.outcome != ERROR:
+                if result.outcome != ERROR:
                     keep(result)
             progress.update(bar, completed=len(score.results), description=score.note())
             if score.clear():
                 for later in group_of:
                     later.cancel()
-                break
-        report = score.report()
-        if make_recorder is not None and not at_once:
-            _record(pool, chosen(report, recordings))
-    return report
+                return
 
 
 @dataclass

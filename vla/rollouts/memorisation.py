@@ -64,8 +64,7 @@ class NearestDemonstration:
     def __init__(self, folder: Path, episodes: Count | None, *, spec: Spec) -> None:
         """Read the first images of the demonstrations in a store: of the first `episodes`, or of all.
 
-        Raises:
-            UserError: as of `open_memory`.
+        There is a UserError if as of `open_memory`.
         """
         store = open_memory(folder, episodes, spec)
         self._entries, self._executed = store.episodes, store.rows("executed")
@@ -108,8 +107,7 @@ class NearestDemonstration:
 def open_memory(folder: Path, episodes: int | None, spec: Spec) -> EpisodeStore:
     """Open the store of the demonstrations to replay in a world with a spec.
 
-    Raises:
-        UserError: there is no such store, it has no or fewer episodes, or another spec.
+    There is a UserError if there is no such store, it has no or fewer episodes, or another spec.
     """
     store = EpisodeStore(folder, episodes)
     store.require_episodes()

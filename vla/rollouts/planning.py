@@ -44,12 +44,9 @@ def power_for_bar(episodes: int, rate: float, bar: float) -> float:
 
 
 def power_of_pairs(episodes: int, discordant: float, difference: float) -> float:
-    """Return the probability that McNemar's exact test finds a difference of two policies on the same episodes.
+    """Return the probability that McNemar's exact test finds a `difference` of two policies on the same episodes.
 
-    Args:
-        episodes: of each policy.
-        discordant: share of the episodes in which only one succeeds.
-        difference: of the success rates.
+    In the share `discordant` of them only one succeeds.
     """
     from scipy.stats import binom
 
@@ -93,15 +90,9 @@ class Stopping:
 def stopping(mean: float, one: float, zero: float, enough: float, fixed: int) -> Stopping | None:
     """Return how long evaluations take that stop as soon as observations of 0 and 1 exclude a mean.
 
-    Args:
-        mean: the one to exclude: a bar, or 1/2 for pairs, of which those count that differ.
-        one: true probability of a 1 in an episode.
-        zero: of a 0.
-        enough: share of the evaluations to be decided.
-        fixed: number of episodes without stopping.
-
-    Returns:
-        None if too few evaluations are decided after `HORIZON` times the fixed number.
+    That is a bar, or 1/2 for pairs, of which those count that differ. An episode gives a 1 and a 0 with the
+    probabilities `one` and `zero`; the share `enough` of the evaluations is to be decided, which would take `fixed`
+    episodes without stopping. Returns None if too few are decided after `HORIZON` times as many.
     """
     from scipy.stats import binom
 
@@ -111,7 +102,7 @@ def stopping(mean: float, one: float, zero: float, enough: float, fixed: int) ->
     ended, by_chance = _ends(bounds, one / counting), _ends(bounds, mean)
 
     def decided(ended: Array, episodes: int) -> float:
-        """Return the share of evaluations that are decided after so many episodes: those that count suffice."""
+        """Return the share of evaluations in which the observations of so many episodes decide."""
         return float(ended @ binom.sf(counts - 1, episodes, counting))
 
     most = episodes_needed(lambda episodes: decided(ended, episodes), enough) if ended.sum() > enough else None
@@ -140,11 +131,9 @@ def _largest_decisive(mean: float, counts: Array) -> Array:
 
 
 def _ends(bounds: tuple[Array, Array], share: float) -> Array:
-    """Return the probabilities that the n-th observation decides, n = 1, 2, …
+    """Return the probabilities that the n-th observation decides, n = 1, 2, …, given the `share` of ones.
 
-    Args:
-        bounds: the largest and the smallest numbers of ones that decide, for every n.
-        share: of ones among observations.
+    `bounds` are the largest and the smallest numbers of ones that decide, for every n.
     """
     undecided, ended = np.zeros(len(bounds[0]) + 2), np.zeros(len(bounds[0]))  # undecided: by the number of ones
     undecided[0], first, last = 1.0, 0, 0

@@ -20,7 +20,8 @@ from vla.io.errors import UserError
 from vla.io.files import atomic_path
 from vla.io.types import Natural, Point
 from vla.rollouts.moving_picture import save_moving_picture
-from vla.spec import Array, Environment, Episode, HasEvents, HasScene, Observation, Shape, Spec
+from vla.rollouts.results import recording_name
+from vla.spec import Array, Environment, Episode, HasScene, Observation, Shape, Spec
 
 # N steps, S series of a plot, D action components, K bins, V vertices, F faces
 
@@ -30,15 +31,10 @@ EVENTS = "events"  # entity of the log
 TOKENS = (56, 84)  # height and width of the image of token probabilities [px]
 
 
-def recording_name(seed: int, outcome: str) -> str:
-    """Return the file name of an episode; in alphabetical order failures come first, and seeds ascend."""
-    return f"success-{seed:08d}" if outcome == "success" else f"failure-{seed:08d}-{outcome}"
-
-
 class RerunRecorder:
     """Recorder of one .rrd file per episode, with the timelines "step" and "time" [s].
 
-    It contains the scene if the environment is `HasScene`, and a log if it is `HasEvents`.
+    It contains the scene if the environment is `HasScene`, and a log if it has `events`.
     """
 
     def __init__(self, folder: str | os.PathLike[str], pictures: Natural) -> None:
@@ -54,7 +50,7 @@ class RerunRecorder:
         """Begin an episode; an unfinished one is discarded."""
         self._spec = environment.spec
         self._world = environment if isinstance(environment, HasScene) else None
-        self._eventful = environment if isinstance(environment, HasEvents) else None
+        self._environment = environment
         self._steps, self._poses = 0, list[dict[str, Array]]()
         self._probabilities: dict[int, Array] = {}
 
@@ -73,7 +69,7 @@ class RerunRecorder:
         stream = rr.RecordingStream("vla", recording_id=f"{name}-{os.urandom(3).hex()}")
         content = rr.binary_stream(stream)  # Rerun's own file sink can block for ever on a full disk
         viewpoint = self._world.viewpoint if self._world else None
-        events = self._eventful.events if self._eventful else ()
+        events = getattr(self._environment, "events", ())
         stream.send_blueprint(_blueprint(spec, bool(self._probabilities), bool(events), viewpoint), make_active=False)
         writer = _Writer(stream, spec)
         writer.facts(episode)
@@ -90,7 +86,7 @@ class RerunRecorder:
         stream.disconnect()
         self._pictured[episode.outcome] += 1
         if self._pictured[episode.outcome] <= self._pictures:
-            save_moving_picture(episode, events, self._folder / f"{name}.webp")
+            save_moving_picture(episode, self._folder / f"{name}.webp")
 
     def _pose(self) -> None:
         if self._world is not None:
@@ -295,8 +291,7 @@ def _curves(what: str, units: Sequence[str]) -> list[rrb.TimeSeriesView]:
 def merge(files: Sequence[Path], target: Path) -> None:
     """Merge recordings into one file, in which the viewer lists them by name.
 
-    Raises:
-        UserError: there are no files, or one of them is no recording.
+    There is a UserError if there are no files, or one of them is no recording.
     """
     if not files:
         raise UserError(f"no recordings to merge into {target}")

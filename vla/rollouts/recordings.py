@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal, Protocol, TypeVar
+from typing import Literal
 
-from vla.rollouts.results import ERROR, Report, Result
-
-log = logging.getLogger(__name__)
+from vla.rollouts.results import ERROR, Report, Result, recording_name
 
 # "all" episodes, the "failures" and a few successes, or so many episodes, failures first.
 Recordings = Literal["all", "failures"] | int
@@ -19,16 +16,6 @@ Recordings = Literal["all", "failures"] | int
 SUCCESSES = 10  # successes beside the failures
 FAILURES_SHOWN, SUCCESSES_SHOWN = 6, 3  # moving pictures
 SUFFIXES = (".rrd", ".webp")  # of a recording and of a moving picture
-
-
-class _Ended(Protocol):
-    @property
-    def seed(self) -> int: ...
-    @property
-    def outcome(self) -> str: ...
-
-
-E = TypeVar("E", bound=_Ended)
 
 
 def chosen(report: Report, wanted: Recordings) -> list[Result]:
@@ -40,46 +27,44 @@ def chosen(report: Report, wanted: Recordings) -> list[Result]:
     return (failures + successes)[: None if wanted == "all" else wanted]
 
 
-def shown(episodes: Iterable[E], failures: int = FAILURES_SHOWN, successes: int = SUCCESSES_SHOWN) -> list[E]:
+def shown(episodes: Iterable[Result], failures: int = FAILURES_SHOWN, successes: int = SUCCESSES_SHOWN) -> list[Result]:
     """Return the first failures, then the first successes; failures cycle through the outcomes."""
-    earlier, places = Counter[str](), list[tuple[int, E]]()
+    earlier, places = Counter[str](), list[tuple[int, Result]]()
     for each in sorted(episodes, key=lambda each: each.seed):
         places.append((earlier[each.outcome], each))
         earlier[each.outcome] += 1
     ordered = [each for _, each in sorted(places, key=lambda place: place[0])]
-    failed, succeeded = ([each for each in ordered if (each.outcome == "success") == good] for good in (False, True))
+    failed, succeeded = ([each for each in ordered if each.success == good] for good in (False, True))
     return failed[:failures] + succeeded[:successes]
 
 
-def clear(folder: Path) -> None:
-    """Remove the recordings and moving pictures in a folder, those of an earlier evaluation."""
+def pictured(results: Iterable[Result], folder: Path) -> dict[int, Path]:
+    """Return seed → moving picture in a folder, of the results that have one."""
+    files = {path.stem: path for path in folder.glob("*.webp")}  # listed, because outcomes may come from a report
+    return {each.seed: files[name] for each in results if (name := recording_name(each.seed, each.outcome)) in files}
+
+
+def clear(folder: Path, kept: Container[Path] = ()) -> None:
+    """Remove the recordings and moving pictures in a folder but for those that are `kept`."""
     for file in folder.glob("*"):
-        if file.suffix in SUFFIXES:
+        if file.suffix in SUFFIXES and file not in kept:
             file.unlink()
 
 
-def keep_recordings(
-    report: Report, folder: Path, target: Path, wanted: Recordings, continues: bool = False
-) -> list[int]:
+def keep_recordings(report: Report, folder: Path, target: Path, wanted: Recordings) -> list[int]:
     """Merge the `wanted` recordings of an evaluation into one file, failures first; return their seeds.
 
-    Unless the evaluation `continues`, only the moving pictures of the episodes to be `shown` stay in the folder, which
-    is removed if it is empty.
+    Only the moving pictures of the episodes to be `shown` stay in the folder, which is removed if it is empty.
     """
-    from vla.rollouts.recorder import merge, recording_name  # imports the viewer's library
+    from vla.rollouts.recorder import merge  # imports the viewer's library
 
-    files = {result.seed: folder / recording_name(result.seed, result.outcome) for result in chosen(report, wanted)}
-    recorded = [seed for seed, file in files.items() if file.with_suffix(".rrd").exists()]
+    wanted_ones = chosen(report, wanted)
+    files = {each.seed: folder / f"{recording_name(each.seed, each.outcome)}.rrd" for each in wanted_ones}
+    recorded = [seed for seed, file in files.items() if file.exists()]
     if recorded:
-        merge([files[seed].with_suffix(".rrd") for seed in recorded], target)
-    if not continues:
-        pictured = [
-            each for each in report.results if each.seed in files and files[each.seed].with_suffix(".webp").exists()
-        ]
-        kept = {files[each.seed].with_suffix(".webp") for each in shown(pictured)}
-        for file in folder.glob("*"):
-            if file.suffix in SUFFIXES and file not in kept:
-                file.unlink()
-        with suppress(OSError):
-            folder.rmdir()
+        merge([files[seed] for seed in recorded], target)
+    pictures = pictured(wanted_ones, folder)
+    clear(folder, [pictures[each.seed] for each in shown(each for each in wanted_ones if each.seed in pictures)])
+    with suppress(OSError):
+        folder.rmdir()
     return recorded

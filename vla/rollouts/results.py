@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,6 +39,11 @@ class Result:
         return self.outcome == "success"
 
 
+def recording_name(seed: int, outcome: str) -> str:
+    """Return the name of the recording of an episode; in alphabetical order failures come first, and seeds ascend."""
+    return f"success-{seed:08d}" if outcome == "success" else f"failure-{seed:08d}-{outcome}"
+
+
 @dataclass(frozen=True)
 class Median:
     """Median over episodes, with its 95 % confidence interval."""
@@ -51,6 +56,20 @@ class Median:
     def __str__(self) -> str:
         """Format both with three digits."""
         return f"{self.median:.3g}" + ("" if self.ci_low is None else f" ({self.ci_low:.3g}-{self.ci_high:.3g})")
+
+
+class Counted(NamedTuple):
+    """Episodes that had an event, such as success, of all that were completed."""
+
+    count: int
+    of: int
+    ci_low: float  # of the 95 % confidence interval of the rate
+    ci_high: float
+
+    @property
+    def rate(self) -> float:
+        """Share of the episodes, 0…1; 0 if there are none."""
+        return self.count / self.of if self.of else 0.0
 
 
 @dataclass(frozen=True)
@@ -148,15 +167,28 @@ class Report:
         return {name: self._part([name]) for name in names}
 
     @property
-    def by_task(self) -> dict[str, Report]:
-        """The same where there are several, or tiers of them; otherwise empty."""
-        return self.tasks if len(self.tasks) > 1 or self.tiers else {}
-
-    @property
     def by_tier(self) -> dict[str, Report]:
         """Tier → report of its episodes; without tiers of which no episode was completed."""
         parts = {tier: self._part(tasks, {tier: tasks}) for tier, tasks in self.tiers.items()}
         return {tier: part for tier, part in parts.items() if part.episodes}
+
+    def counted(self, count: int | None = None) -> Counted:
+        """Return the rate of an event that `count` completed episodes had, by default of success."""
+        if count is None:
+            return Counted(self.successes, self.episodes, *self.interval)
+        return Counted(count, self.episodes, *self.interval_of(count))
+
+    @property
+    def rates(self) -> dict[str, dict[str, Counted]]:
+        """What there is beside the rate of success, name → rate: of milestones, of instructions completed in a row, and
+        success by task and by tier; by task where there are several, or tiers of them."""
+        tasks = self.tasks if len(self.tasks) > 1 or self.tiers else {}
+        return {
+            "milestones": {name: self.counted(count) for name, count in self.milestones.items()},
+            "in_a_row": {name: self.counted(count) for name, count in self.in_a_row.items()},
+            "tasks": {name: part.counted() for name, part in tasks.items()},
+            "tiers": {name: part.counted() for name, part in self.by_tier.items()},
+        }
 
     def _part(self, tasks: Sequence[str], tiers: Mapping[str, Sequence[str]] | None = None) -> Report:
         results = tuple(result for result in self.results if result.task in tasks)
@@ -192,31 +224,26 @@ class Report:
         return "mean over tiers" if known == len(listed) else f"mean over tiers ({known} of {len(listed)} tasks)"
 
     def __str__(self) -> str:
-        """Format failures, errors, milestones, motion, several instructions, several tasks, tiers and, last, the
-        success rate with its interval."""
+        """Format failures, errors, motion, all rates and, last, the success rate with its interval."""
         ci = "anytime-valid 95 % CI" if self.anytime else "95 % CI"
         lines = [f"{name} {count}" for name, count in self.outcome_counts.items() if name not in ("success", ERROR)]
         if self.errors:
             first = self.errors[0]
             lines.append(f"errors {len(self.errors)}, the first at seed {first.seed}: {first.error}")
-        lines += [f"{name} {self._rate(ci, count)}" for name, count in self.milestones.items()]
         if medians := [f"{AMOUNTS[name]} {median}" for name, median in self.medians.items()]:
             lines.append(f"medians of the successes, {ci}: {', '.join(medians)}")
-        lines += [f"{name} completed in {self._rate(ci, count)}" for name, count in self.in_a_row.items()]
         if row := self.mean_in_a_row:
             lines.append("completed in a row on average {:.2f} ({ci} {:.2f}-{:.2f})".format(*row, ci=ci))
-        if len(self.tasks) > 1:
-            lines += [f"{task} {report._rate(ci)}" for task, report in self.tasks.items()]
-        lines += [f"{tier.replace('_', ' ')} {report._rate(ci)}" for tier, report in self.by_tier.items()]
+        rates = [each for kind in self.rates.values() for each in kind.items()]
+        lines += [f"{name.replace('_', ' ')} {_text(found, ci)}" for name, found in rates]
         if mean := self.mean_over_tiers:
             rate, low, high = (100 * value for value in mean)
             lines.append(f"{self.mean_label} {rate:.1f} % ({ci} {low:.1f}-{high:.1f})")
-        return "\n".join([*lines, f"success {self._rate(ci)}"])
+        return "\n".join([*lines, f"success {_text(self.counted(), ci)}"])
 
-    def _rate(self, ci: str, count: int | None = None) -> str:
-        """Format the rate of an event that `count` completed episodes had, by default that of success."""
-        if not self.episodes:
-            return "0/0 (no episode was completed)"
-        count, (low, high) = (self.successes, self.interval) if count is None else (count, self.interval_of(count))
-        share = count / self.episodes
-        return f"{count}/{self.episodes} ({100 * share:.1f} %, {ci} {100 * low:.1f}-{100 * high:.1f})"
+
+def _text(found: Counted, ci: str) -> str:
+    if not found.of:
+        return "0/0 (no episode was completed)"
+    low, high = 100 * found.ci_low, 100 * found.ci_high
+    return f"{found.count}/{found.of} ({100 * found.rate:.1f} %, {ci} {low:.1f}-{high:.1f})"

@@ -19,9 +19,8 @@ def rollout(
 ) -> Episode:
     """Run the episode of `seed` to its end: `vla.rollouts.worlds.play` in one world.
 
-    Raises:
-        UserError: the agent returned an action of the wrong shape, or one that is not finite, or the episode is over
-            at its start.
+    There is a UserError if the agent returned an action of the wrong shape, or one that is not finite, or the episode
+    is over at its start.
     """
     worlds = Worlds([Stage(environment, recorder)])
     ((_, ended),) = play(worlds, in_lanes(agent), [seed], recorder is not None, all_images)

@@ -17,7 +17,6 @@ odds of the mean over tasks then lose.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import log
 
 import numpy as np
@@ -32,13 +31,9 @@ ON_SUCCESS = np.cos((2 * np.arange(BETS) + 1) * np.pi / (4 * BETS)) ** 2
 
 
 def log_capital(mean: float, ones: Array | float, zeros: Array | float, halves: Array | int = 0) -> Array:
-    """Return the logarithm of the capital after bets against the hypothesis that observations have this mean.
+    """Return the logarithm of the capital after bets against observations of this mean, which is between 0 and 1.
 
-    Args:
-        mean: of observations of 0, 1/2 and 1; between 0 and 1.
-        ones: number of observations of 1, of any shape.
-        zeros: of 0, of the same shape.
-        halves: of 1/2, of the same shape.
+    The numbers of observations of 1, of 0 and of 1/2 may be arrays of one shape.
     """
     one, zero = ON_SUCCESS / mean, (1 - ON_SUCCESS) / (1 - mean)
     counts = np.stack(np.broadcast_arrays(ones, zeros, halves), -1).astype(float)
@@ -71,10 +66,8 @@ def anytime_interval(ones: float, zeros: float, halves: int = 0) -> tuple[float,
         inside, outside = estimate, end
         for _ in range(40):
             middle = (inside + outside) / 2
-            if log_capital(middle, ones, zeros, halves) < limit:
-                inside = middle
-            else:
-                outside = middle
+            below = log_capital(middle, ones, zeros, halves) < limit
+            inside, outside = (middle, outside) if below else (inside, middle)
         return inside
 
     return 0.0 if ones + halves == 0 else bound(0.0), 1.0 if zeros + halves == 0 else bound(1.0)
@@ -108,19 +101,3 @@ def is_decided(first: int, second: int, pairs: int, margin: float, comparisons: 
     within = abs(second - first) < margin * pairs
     ends = ((1 - margin) / 2, (1 + margin) / 2)
     return within and all(excludes(end, second, first, pairs - first - second) for end in ends)
-
-
-def decided_after(outcomes: Sequence[tuple[bool, bool]], margin: float, turns: int = 1) -> int | None:
-    """Return the number of episodes after which the comparison of two success rates is decided; None if it never is.
-
-    Args:
-        outcomes: whether the first policy succeeded, and the second, in the order of the episodes.
-        margin: as in `is_decided`.
-        turns: number of tasks that take turns; decisions are made after whole rounds.
-    """
-    first = second = 0
-    for pairs, (one, other) in enumerate(outcomes, start=1):
-        first, second = first + (one and not other), second + (other and not one)
-        if pairs % turns == 0 and is_decided(first, second, pairs, margin):
-            return pairs
-    return None

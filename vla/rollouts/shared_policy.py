@@ -31,7 +31,7 @@ MOST = 1024  # workers
 Request = tuple[str, int, Any, Future[Any]]  # "act" or "plan", lane, observation; or "reset", lane, (instruction, seed)
 
 
-class Planner(Agents, Protocol):
+class _Planner(Agents, Protocol):
     """Agents that plan chunks, as `vla.policy.Policy`."""
 
     spec: Spec
@@ -43,7 +43,7 @@ class Planner(Agents, Protocol):
 
 
 @contextmanager
-def shared_policy(make_policy: Callable[[], Planner]) -> Iterator[Callable[[Environment], DistantPolicy]]:
+def shared_policy(make_policy: Callable[[], _Planner]) -> Iterator[Callable[[Environment], _DistantPolicy]]:
     """Run a policy for all workers on this machine within the context, which is entered with the factory of agents."""
     with one_thread_each(), Listener(family="AF_UNIX", authkey=(key := secrets.token_bytes(32))) as listener:
         policy, requests = make_policy(), queue.Queue[Request | None]()
@@ -68,7 +68,7 @@ def _accept(listener: Listener, begin: Callable[[int, Connection], object]) -> N
             begin(lane, connection)
 
 
-def _serve(policy: Planner, requests: queue.Queue[Request | None]) -> None:
+def _serve(policy: _Planner, requests: queue.Queue[Request | None]) -> None:
     """Answer requests, those that wait together in one call of the policy, until there is None."""
     while (first := requests.get()) is not None:
         waiting = [first]
@@ -81,7 +81,7 @@ def _serve(policy: Planner, requests: queue.Queue[Request | None]) -> None:
                 _answer(call, alike)
 
 
-def _reset(policy: Planner, episodes: Sequence[tuple[str, int]], lanes: Sequence[int]) -> Sequence[None]:
+def _reset(policy: _Planner, episodes: Sequence[tuple[str, int]], lanes: Sequence[int]) -> Sequence[None]:
     return [policy.reset(instruction, seed, lane) for (instruction, seed), lane in zip(episodes, lanes, strict=True)]
 
 
@@ -100,7 +100,7 @@ def _answer(call: Callable[..., Iterable[Any]], requests: Sequence[Request]) -> 
             request[3].set_result(answer)
 
 
-def _talk(policy: Planner, requests: queue.Queue[Request | None], lane: int, connection: Connection) -> None:
+def _talk(policy: _Planner, requests: queue.Queue[Request | None], lane: int, connection: Connection) -> None:
     """Ask the policy what a worker asks, until it leaves."""
     spec, memory = policy.spec, SharedMemory(create=True, size=sum(_sizes(policy.spec)))
     try:
@@ -140,7 +140,7 @@ def _views(memory: SharedMemory, spec: Spec) -> dict[str, Array]:
     return views | {"": np.ndarray(len(spec.state), np.float32, memory.buf, int(starts[len(spec.cameras)]))}
 
 
-class DistantPolicy:
+class _DistantPolicy:
     """The agent of one world whose policy is in another process of this machine."""
 
     def __init__(self, address: str, key: bytes, spec: Spec) -> None:
@@ -194,5 +194,5 @@ class DistantPolicy:
         self._connection.close()
 
 
-def _connected(address: str, key: bytes, environment: Environment) -> DistantPolicy:
-    return DistantPolicy(address, key, environment.spec)
+def _connected(address: str, key: bytes, environment: Environment) -> _DistantPolicy:
+    return _DistantPolicy(address, key, environment.spec)

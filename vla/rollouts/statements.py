@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from vla.io.errors import UserError
-from vla.rollouts.comparison import compare_pairs, pairs_of
+from vla.rollouts.comparison import Together, compare_pairs, pairs_of
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.sequential import excludes, is_decided
 
@@ -50,20 +50,17 @@ class AgainstRun:
     def is_decided(self, report: Report) -> bool:
         """Return whether the episodes of a report decide the statement, or the other run has no later ones.
 
-        It is valid after any number of episodes.
-
-        Raises:
-            UserError: the other run has other episodes with the same seeds.
+        It is valid after any number of episodes. A UserError tells that equal seeds are other episodes.
         """
-        pairs = pairs_of(self._common(report))
-        if not sum(pairs) and sum(pairs_of(self._paired(report))):
+        seen, pairs = self._paired(report, alike=False), pairs_of(self._paired(report))
+        if sum(pairs_of(seen)) and not sum(pairs):
             self.require_common(())
         ended = bool(report.results) and report.results[-1].seed >= max(self.results)
         return ended or is_decided(pairs.first, pairs.second, sum(pairs), self.margin)
 
     def say(self, report: Report) -> str:
         """Describe the verdict on a finished report in one sentence."""
-        found = compare_pairs(pairs_of(self._common(report)), self.anytime or report.anytime)
+        found = compare_pairs(pairs_of(self._paired(report)), self.anytime or report.anytime)
         if not found.episodes:
             return f"no episode in common with {self.run}"
         verdict = found.conclude(found.p, self.margin).verdict
@@ -73,14 +70,14 @@ class AgainstRun:
             f"({low} to {high}), p = {found.p:.2g}"
         )
 
-    def _paired(self, report: Report) -> list[tuple[Result, Result]]:
-        """Return results of the other run and of this one with the same seeds."""
-        return [(self.results[mine.seed], mine) for mine in report.results if mine.seed in self.results]
+    def _paired(self, report: Report, alike: bool = True) -> Together:
+        """Return results of the other run and of this one with the same seeds.
 
-    def _common(self, report: Report) -> list[tuple[Result, Result]]:
-        """Return those of the same episodes: another goal or level of randomisation gives a seed another one."""
-        pairs = self._paired(report)
-        return [(one, two) for one, two in pairs if (one.instruction, one.draws) == (two.instruction, two.draws)]
+        `alike`: of the same episodes only, because another goal or level of randomisation gives a seed another one.
+        """
+        pairs = [(self.results[mine.seed], mine) for mine in report.results if mine.seed in self.results]
+        same = [(one.instruction, one.draws) == (two.instruction, two.draws) for one, two in pairs]
+        return [pair for pair, equal in zip(pairs, same, strict=True) if equal or not alike]
 
 
 Statement = AgainstBar | AgainstRun

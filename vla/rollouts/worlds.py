@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from vla.io.errors import UserError
-from vla.spec import Agent, Agents, Array, Environment, Episode, HasTool, MultiInstruction, Observation, Recorder
+from vla.spec import Agent, Agents, Array, Environment, Episode, Observation, Recorder
 
 
 class Stage:
@@ -27,19 +27,13 @@ class Stage:
         self._recording: Recorder | None = None
 
     def reset(self, seed: int, recorded: bool = False) -> Observation:
-        """Start the episode of a seed.
-
-        Raises:
-            UserError: it is over at its start.
-        """
+        """Start the episode of a seed; a UserError if it is over at its start."""
         self._now = self.environment.reset(seed)
         if self.environment.done:
             raise UserError(f"the episode of seed {seed} is over at its start: `reset` must draw another one")
         self._seed, self._seen, self._clean, self._executed = seed, list[Observation](), list[Array](), list[Array]()
-        # Now, because the tool of a world may exist from its first episode on.
-        world = self.environment
-        self._traced = world if isinstance(world, HasTool) else None
-        self._tool = [self._traced.tool] if self._traced else []
+        # Asked now, because the tool of a world may exist from its first episode on.
+        self._tool = [getattr(self.environment, "tool", None)]
         self._recording = self._recorder if recorded else None
         if self._recording is not None:
             self._recording.start(self.environment)
@@ -58,12 +52,13 @@ class Stage:
             self._recording.step(self._now, action, info)
         with self.environment.blind() if blind else nullcontext():
             self._now = self.environment.step(action)
-        if self._traced:
-            self._tool.append(self._traced.tool)
+        if self._tool[0] is not None:
+            self._tool.append(getattr(self.environment, "tool", None))
         return self._ended(info) if self.environment.done else self._now
 
     def _ended(self, info: Mapping[str, Any]) -> Episode:
-        environment = self.environment
+        environment: Any = self.environment  # which may have instructions
+        count = getattr(environment, "instructions", 1)
         episode = Episode(
             seed=self._seed,
             task=environment.task,
@@ -74,8 +69,8 @@ class Stage:
             observations=self._seen,
             actions=np.asarray(self._clean, dtype=np.float32),
             executed=np.asarray(self._executed, dtype=np.float32),
-            completed=_completed(environment),
-            tool=np.array(self._tool) if self._traced else None,
+            completed=(environment.completed, count) if count > 1 else None,
+            tool=None if self._tool[0] is None else np.array(self._tool),
         )
         if self._recording is not None:
             self._recording.end(episode)
@@ -109,7 +104,7 @@ class Worlds:
         return answers
 
 
-class Alone:
+class _Alone:
     """An agent of one world in a single lane."""
 
     def __init__(self, agent: Agent) -> None:
@@ -137,7 +132,7 @@ class Alone:
 
 def in_lanes(agent: Agent | Agents) -> Agents:
     """Return agents in lanes; an agent of one world is in a single one."""
-    return agent if isinstance(agent, Agents) else Alone(agent)
+    return agent if isinstance(agent, Agents) else _Alone(agent)
 
 
 @dataclass
@@ -220,7 +215,7 @@ def _acted(agents: Agents, seen: Mapping[int, Observation], components: int) -> 
     for lane, action in zip(lanes, actions, strict=True):
         found[lane] = action
         if action.shape != (components,) or not np.isfinite(action).all():
-            name = type(agents.agent if isinstance(agents, Alone) else agents).__name__
+            name = type(agents.agent if isinstance(agents, _Alone) else agents).__name__
             found[lane] = UserError(f"{name} must return {components} finite numbers, got {action}")
     return found
 
@@ -230,8 +225,3 @@ def copied(seen: Observation) -> Observation:
     rgb, depth = ({name: np.array(image) for name, image in images.items()} for images in (seen.rgb, seen.depth))
     truth = None if seen.truth is None else {name: np.array(value) for name, value in seen.truth.items()}
     return replace(seen, rgb=rgb, depth=depth, truth=truth, state=np.array(seen.state, np.float32))
-
-
-def _completed(environment: Environment) -> tuple[int, int] | None:
-    several = isinstance(environment, MultiInstruction) and environment.instructions > 1
-    return (environment.completed, environment.instructions) if several else None

@@ -17,11 +17,11 @@ from vla.config.nodes import Evaluation
 from vla.config.origin import Origin
 from vla.io.documents import LENIENT, STRICT
 from vla.io.errors import UserError
-from vla.io.types import Count, Natural, NonNegative, Positive, Share
+from vla.io.types import Count, Natural, NonNegative, Positive
 from vla.rollouts.comparison import Comparison
 from vla.rollouts.motion import Motion
 from vla.rollouts.results import Report, Result
-from vla.spec import IN_DISTRIBUTION, readable
+from vla.spec import IN_DISTRIBUTION
 
 Node = dict[str, Any]
 # What reports read of a config, key → type; everything else is only shown.
@@ -62,27 +62,7 @@ class Training:
     steps: Natural
     seconds: NonNegative
     ended: str  # "done", "interrupted", or an error
-    collection_s: NonNegative | None = None  # duration of the collection, if known
     origins: list[Origin] = field(default_factory=list)  # of its beginning, and of what continued it
-
-
-@dataclass(frozen=True)
-class Round:
-    """Round of `job=improve`: episodes that the expert labelled, and the training that followed."""
-
-    __pydantic_config__ = STRICT
-
-    episodes: Natural  # 0: training on demonstrations alone
-    successes: Natural  # of these episodes, by the policy before this training, or by it and the expert in turns
-    collection_s: NonNegative  # duration of the episodes
-    training_s: NonNegative
-    validation: Share | None  # success rate in the last validation; None without one
-
-    def __str__(self) -> str:
-        """Format the successes before and after the training."""
-        acted = f"{self.successes} of {self.episodes} labelled episodes were successes"
-        after = "" if self.validation is None else f"{100 * self.validation:.0f} % in validation afterwards"
-        return ", ".join(part for part in (acted if self.episodes else "", after) if part) or "trained"
 
 
 @dataclass(frozen=True)
@@ -97,12 +77,6 @@ class ComponentError:
     ci_low: NonNegative
     ci_high: NonNegative | None  # None: unbounded
     constant: NonNegative  # error of the mean action of the training episodes
-
-    def readable(self) -> tuple[str, str, str, str]:
-        """Format unit, error, its interval and the constant error, in units for display."""
-        factor, unit = readable(self.unit)
-        high = "∞" if self.ci_high is None else f"{factor * self.ci_high:.3g}"
-        return unit, f"{factor * self.error:.3g}", f"{factor * self.ci_low:.3g}-{high}", f"{factor * self.constant:.3g}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +93,6 @@ class ErrorsFile:
     origin: Origin | None = None
     parameters: Count | None = None
     latency_ms: Positive | None = None
-    wall_time_s: NonNegative | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,8 +102,7 @@ class Condition:
     __pydantic_config__ = LENIENT
 
     outcomes: list[str]  # with `anytime`, of the first seeds
-    comparison: Comparison | None = None  # with the training condition
-    secondary: dict[str, Comparison] = field(default_factory=dict)  # milestone or field of `Motion` → the same
+    compared: dict[str, Comparison] = field(default_factory=dict)  # with the training condition, in success and others
     # Per episode, as `outcomes`; empty in reports written before these were stored.
     reached: list[tuple[str, ...]] = field(default_factory=list)  # milestones
     motions: list[Motion | None] = field(default_factory=list)
@@ -162,8 +134,6 @@ class ReportFile:
     anytime: bool = False  # as of a condition
     parameters: Count | None = None
     latency_ms: Positive | None = None
-    wall_time_s: NonNegative | None = None
-    rounds: list[Round] = field(default_factory=list)  # of job=improve
     versions: dict[str, str] = field(default_factory=dict)  # library → version
     statements: list[str] = field(default_factory=list)  # on what the evaluation was to decide
     origin: Origin | None = None

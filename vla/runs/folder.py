@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import logging
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -97,31 +96,10 @@ def read_training(folder: Path) -> Training | None:
 
 
 def archive_evaluation(folder: Path, number: int) -> None:
-    """Archive the evaluation after `number` steps, or rounds, because further training changes the policy."""
-    names = (REPORT, ERRORS, PLOT, SUITE, ERRORS_PLOT, RECORDING, RECORDINGS)
-    if files := [file for name in names if (file := folder / name).exists()]:
-        target = folder / f"evaluation_{number}"
-        target.mkdir(exist_ok=True)
-        for file in files:
-            if file.is_dir():
-                shutil.rmtree(target / file.name, ignore_errors=True)  # else it could not be replaced
-            file.replace(target / file.name)
-        log.info("moved the evaluation so far to %s", target)
-
-
-def wall_time(policy: Path, evaluation: float) -> float | None:
-    """Return the wall time of collection, training and evaluation of a policy [s], or None if unknown.
-
-    `policy` is its folder, in that of the run that trained it, and `evaluation` the duration of the last part [s].
-    """
-    try:
-        training = read_training(policy.resolve().parent)
-    except (OSError, ValueError) as error:  # it only informs
-        log.warning("the wall time is unknown: %s", error)
-        return None
-    if training is None or training.collection_s is None:
-        return None
-    return round(training.collection_s + training.seconds + evaluation, 1)
+    """Rename report and recording after `number` steps, or rounds, because further training changes the policy."""
+    for file in (folder / name for name in (REPORT, ERRORS, RECORDING)):
+        if file.exists():
+            file.replace(folder / f"{file.stem}_{number}{file.suffix}")
 
 
 def require_run(folder: Path) -> Run:
@@ -170,26 +148,19 @@ def _curves(path: Path) -> dict[str, Curve]:
 def metric_rows(path: Path) -> list[dict[str, str]]:
     """Read metrics.csv as rows of column → number, as text, without empty cells; each has a `step`.
 
-    Raises:
-        UserError: the file is too large, has no steps or holds something else than numbers.
+    There is a UserError if the file is too large, has no steps or holds something else than numbers.
     """
-    rows = csv.reader(io.StringIO(read_bounded(path).decode("utf-8", "replace"), newline=""))
-    found = []
+    rows, found = csv.reader(io.StringIO(read_bounded(path).decode("utf-8", "replace"), newline="")), []
     try:
         names = next(rows, ["step"])
-        if "step" not in names or len(set(names)) < len(names):
-            raise UserError("there is no column step, or a column twice")
-        if len(names) > MOST_METRICS:
-            raise UserError(f"there are more than {MOST_METRICS} columns")
+        if "step" not in names or len(set(names)) < len(names) or len(names) > MOST_METRICS:
+            raise UserError(f"there is no column step, one twice, or more than {MOST_METRICS}")
         for row in rows:
-            if len(row) < len(names):  # truncated by a killed process
-                continue
-            numbers = {name: value for name, value in zip(names, row, strict=True) if value}
-            for value in numbers.values():
-                float(value)
-            if not 0 <= int(numbers.get("step", -1)) < 2**31:
-                raise UserError(f"step is no count, but {numbers.get('step')}")
-            found.append(numbers)
+            if len(row) >= len(names):  # else truncated by a killed process
+                numbers = {name: value for name, value in zip(names, row, strict=True) if value}
+                if not 0 <= int(numbers.get("step", -1)) < 2**31 or not [*map(float, numbers.values())]:
+                    raise UserError(f"step is no count, but {numbers.get('step')}")
+                found.append(numbers)
     except (ValueError, csv.Error) as error:
         raise UserError(f"{path} is damaged in line {rows.line_num}: {str(error)[:200]}") from error
     return found

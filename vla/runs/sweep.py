@@ -35,16 +35,6 @@ class SweepRow:
         return " ".join(self.choices.values()) or "all"
 
     @property
-    def parameters(self) -> int:
-        """Number of parameters; 0 if another agent than a policy acted."""
-        return self.runs[0].parameters or 0
-
-    @property
-    def latencies(self) -> list[float]:
-        """Latencies of the cells in which a policy acted [ms]."""
-        return [run.report.latency_ms for run in self.runs if run.report and run.report.latency_ms]
-
-    @property
     def rates(self) -> list[float]:
         """Success rate of every cell."""
         return [run.reports[IN_DISTRIBUTION].success for run in self.runs]
@@ -57,11 +47,6 @@ class SweepRow:
             ended = {result.seed: result.success for result in report.results if result.outcome != ERROR}
             found.setdefault(condition, []).append(ended)
         return found
-
-    @property
-    def latency(self) -> float:
-        """Minimum latency of the cells [ms], because other load on the machine only increases it; needs a policy."""
-        return min(self.latencies)
 
     @property
     def successes(self) -> dict[str, int]:

@@ -1,7 +1,7 @@
 """`job=benchmark`: throughput and latency of every stage, next to a floor that is measured in the same run.
 
-The floor is a reference value in the same unit: the unavoidable part of the work, a whole step, another renderer or
-another project. `ratio` is value / floor. Each stage is a function of its name in a module of this package.
+The floor is a reference value in the same unit: the unavoidable part of the work, a whole step or another renderer.
+`ratio` is value / floor. Each stage is a function of its name in a module of this package.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from vla.config.experiment import Experiment
 from vla.config.nodes import Benchmark
 from vla.io.files import write_json
 from vla.io.printable import show
-from vla.jobs.benchmark.measure import BUSY, Measure, OtherLoad, machine
+from vla.jobs.benchmark.measure import Measure, machine, other_load
 from vla.parallel.limits import cores
 
 log = logging.getLogger(__name__)
 
-MODULES = dict.fromkeys(("policy", "evaluate", "deploy", "serve"), "acting")  # others are named like their stage
+BUSY = 0.05  # share of all cores that spoils a figure when other programs use it
+MODULES = dict.fromkeys(("policy", "evaluate"), "acting")  # others are named like their stage
 
 
 def run(experiment: Experiment) -> dict[str, Measure]:
@@ -30,8 +31,9 @@ def run(experiment: Experiment) -> dict[str, Measure]:
 
     here, found = machine(), dict[str, Measure]()
     for name in experiment.options(Benchmark).names:
-        stage, others = getattr(import_module(f"{__name__}.{MODULES.get(name, name)}"), name), OtherLoad()
-        measured, used = stage(experiment), others.cores()
+        stage, (others, began) = getattr(import_module(f"{__name__}.{MODULES.get(name, name)}"), name), other_load()
+        measured, (others_now, now) = stage(experiment), other_load()
+        used = max(0.0, others_now - others) / max(now - began, 1e-9)
         found |= {key: {**each, "others": round(used, 2)} for key, each in measured.items()}
         if used > BUSY * cores():
             slower = "is slower here than on an idle machine, and its ratios are less exact"

@@ -1,4 +1,4 @@
-"""Throughput of collection and its breakdown, the renderers of a task, and the throughput of robosuite."""
+"""Throughput of collection and its breakdown, and the renderers of a task."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vla.config.nodes import Benchmark
 from vla.config.packages import CONF
 from vla.data.episodes import EpisodeStore
 from vla.io.documents import read_yaml
-from vla.jobs.benchmark.measure import DURATION, HasMinimalStep, Measure, measure, peer, timed
+from vla.jobs.benchmark.measure import Measure, measure, timed
 from vla.parallel.limits import cores
 from vla.parallel.pool import Cluster
 from vla.parallel.processes import WorkerFactory
@@ -27,14 +27,15 @@ def collect(experiment: Experiment) -> dict[str, Measure]:
     """Measure control steps per second of one process with all cameras; the floor is physics and rendering alone.
 
     Then the parts of a step, whose floor is the whole step; its images by each renderer, whose floor is the fastest;
-    all processes, whose floor is that of one times their number; and robosuite, if `benchmark.robosuite` names it.
+    and all processes, whose floor is that of one times their number. A world that can run the unavoidable part of a
+    step by itself has `minimal_step()`, which returns "physics" and "rendering" → a function that does it.
     """
-    asked, unit = experiment.options(Benchmark), "control steps/s"
+    count, unit = experiment.options(Benchmark).episodes, "control steps/s"
     makers = experiment.make_environment(), experiment.make_expert()
     environment = makers[0]()
     expert = makers[1](environment)
     rollout(environment, expert, 0)  # warm-up: compiles shaders
-    episodes, taken = _timed_parts(environment, expert, asked.episodes)
+    episodes, taken = _timed_parts(environment, expert, count)
     steps = sum(len(episode.actions) for episode in episodes)
     with TemporaryDirectory() as folder:
         store = EpisodeStore.create_or_open(folder, environment.spec, {})
@@ -51,15 +52,8 @@ def collect(experiment: Experiment) -> dict[str, Measure]:
         found[f"collect: {name}"] = measure(1000 * seconds / steps, "ms/step", steps, whole)
     found |= _renderers(experiment)
     work = partial(DemonstrationWorker, *makers)
-    rates = {count: _verified(work, count, asked.episodes) for count in (1, cores())}
-    found[f"collect: {cores()} processes"] = measure(rates[cores()], unit, steps, cores() * rates[1])
-    if asked.robosuite is not None:
-        arguments = (*environment.spec.image_size, DURATION)
-        rivals = {n: peer("robosuite", asked.robosuite, "robosuite_lift.py", arguments, n) for n in rates}
-        # robosuite verifies nothing: the same work is a rollout without verification.
-        found["collect, against robosuite"] = measure(steps / full, unit, steps, rivals[1])
-        for count, rival in rivals.items():
-            found[f"collect: verified, against {count} of robosuite"] = measure(rates[count], unit, steps, rival)
+    alone, together = (_verified(work, processes, count) for processes in (1, cores()))
+    found[f"collect: {cores()} processes"] = measure(together, unit, steps, cores() * alone)
     return found
 
 
@@ -68,7 +62,7 @@ def _timed_parts(environment: Environment, expert: Agent, count: int) -> tuple[l
 
     The parts of an episode follow each other, so that what else runs on the machine slows all alike.
     """
-    calls = environment.minimal_step() if isinstance(environment, HasMinimalStep) else {}
+    calls = getattr(environment, "minimal_step", dict)()
     episodes, taken = list[Episode](), dict.fromkeys((*calls, "full", "blind", "replay"), 0.0)
     for seed in range(count):
         episode, seconds = timed(partial(rollout, environment, expert, seed))

@@ -1,4 +1,4 @@
-"""Throughput of the loader, also of large images, and of LeRobot's loader."""
+"""Throughput of the loader, also of large images."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from vla.config.build import build
-from vla.config.compose import compose
-from vla.config.experiment import Experiment, plain
+from vla.config.experiment import Experiment
 from vla.config.nodes import Benchmark
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
 from vla.data.window_batches import aligned_empty
-from vla.jobs.benchmark.measure import DURATION, Measure, measure, peer, timed
+from vla.jobs.benchmark.measure import Measure, measure, timed
 from vla.jobs.collect import demonstrations
 from vla.rollouts.rollout import rollout
 from vla.spec import Episode
@@ -24,31 +22,21 @@ from vla.spec import Episode
 ROUNDS = 5  # of the loader and of its floor, in turns; the fastest counts
 LARGE = 224  # height and width of large images [px]
 EPISODES, STEPS = 2500, 100  # of a store whose size is extrapolated
-PEER_EPISODES = 50  # maximum number of episodes for LeRobot's loader
 
 
 def loader(experiment: Experiment) -> dict[str, Measure]:
     """Measure windows per second with the history of the model and others; the floor is a bare gather of the images.
 
     Where the size of images is an option of the task, so is a store of large ones from three cameras in two codecs; the
-    floor of its size is the raw one. If `benchmark.lerobot` names a Python with LeRobot, so is its loader as a floor.
+    floor of its size is the raw one.
     """
-    asked, store = experiment.options(Benchmark), demonstrations(experiment)
+    store = demonstrations(experiment)
     model = experiment.fitted_learner(store).model
     alone = experiment.with_values({"collect.more": None})  # the floor reads one store
     names = {"loader": model.history, "loader: 1 frame": 1, "loader: 6 frames": 6}
     found = {name: _loading(alone, store, frames, model.chunk) for name, frames in names.items()}
     if "image_size" in experiment.task:
         found |= _of_large_images(alone.with_values({"task.image_size": [LARGE, LARGE]}), model.chunk)
-    if asked.lerobot is not None:
-        some = EpisodeStore(store.folder, min(experiment.collect.episodes, PEER_EPISODES))
-        with TemporaryDirectory() as folder:
-            export = plain(compose("export=lerobot", f"output={folder}").export)
-            dataset = build(export, "export").export(some, experiment.cluster())
-            for name in [*names][1:]:
-                rival = peer("lerobot", asked.lerobot, "lerobot_windows.py", (dataset, names[name], DURATION))
-                own = found[name]
-                found[f"{name}, against LeRobot"] = measure(own["value"], own["unit"], own["n"], rival)
     return found
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,13 +13,11 @@ import torch
 
 from vla.config.experiment import Experiment
 from vla.config.nodes import Benchmark
-from vla.io.errors import UserError
 from vla.jobs.benchmark.measure import Measure, measure
 from vla.jobs.collect import demonstrations
-from vla.jobs.machine import computes_on_cpu, has_bfloat16
 from vla.runs.folder import CHECKPOINTS
 from vla.training.device import now
-from vla.training.trainer import PRECISIONS, explain_memory_errors, make_trainer, quiet_lightning
+from vla.training.trainer import explain_memory_errors, make_trainer, quiet_lightning
 
 log = logging.getLogger(__name__)
 
@@ -32,17 +29,11 @@ def train(experiment: Experiment) -> dict[str, Measure]:
 
     The floor is forward pass, backward pass and optimiser step alone, on one batch. Rounds alternate and the fastest
     counts, so that other load on the machine affects all alike.
-
-    Raises:
-        UserError: there is nothing to measure, or not enough memory.
     """
     asked = experiment.options(Benchmark)
-    precisions = _precisions(asked.precisions, computes_on_cpu(experiment.trainer["accelerator"]))
-    if not precisions or not asked.compile:
-        raise UserError("training is timed in each of benchmark.precisions and benchmark.compile: both need an entry")
     quiet_lightning()
-    store, trials = demonstrations(experiment), list[tuple[str, Experiment, Any, list[Stopwatch]]]()
-    for precision, compiled in product(precisions, sorted(set(asked.compile))):
+    store, trials = demonstrations(experiment), list[tuple[str, Experiment, Any, list[_Stopwatch]]]()
+    for precision, compiled in product(asked.precisions, sorted(set(asked.compile))):
         changes = {
             "learner.compile": compiled,
             "trainer.precision": precision,
@@ -55,7 +46,7 @@ def train(experiment: Experiment) -> dict[str, Measure]:
         trials.append((name, changed, changed.fitted_learner(store), []))
     for _ in range(asked.rounds):
         for _, changed, learner, rounds in trials:
-            model, watch = learner.model, Stopwatch(asked.steps)
+            model, watch = learner.model, _Stopwatch(asked.steps)
             data = changed.data(store, model.history, model.chunk, model.text.tokenize)
             with explain_memory_errors(experiment.config), TemporaryDirectory() as folder:
                 trainer = make_trainer(changed.config, Path(folder) / CHECKPOINTS, watch)
@@ -70,16 +61,7 @@ def train(experiment: Experiment) -> dict[str, Measure]:
     return found
 
 
-def _precisions(asked: Sequence[str] | None, on_processor: bool) -> Sequence[str]:
-    if asked is not None:
-        return asked
-    if on_processor and not has_bfloat16():
-        log.info("bf16 is left out: this processor has no instructions for it; benchmark.precisions=[bf16] times it")
-        return ["fp32"]
-    return list(PRECISIONS)
-
-
-class Stopwatch(lightning.Callback):
+class _Stopwatch(lightning.Callback):
     """Callback that times the steps of a training after a warm-up, then as many of the model alone [s]."""
 
     def __init__(self, steps: int) -> None:

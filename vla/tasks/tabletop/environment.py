@@ -36,8 +36,8 @@ QUANTILES = np.array([NormalDist().inv_cdf((index + 0.5) / 256) for index in ran
 
 
 class Tabletop(World):
-    """`Simulation` as an `Environment` with camera observations, also `HasScene`, `TakesJointTargets`, `HasEvents` and
-    `MultiInstruction`.
+    """`Simulation` as an `Environment` with camera observations, also `HasScene` and `TakesJointTargets`,
+    with events, a tool and instructions.
 
     An episode of a chain below `FIRST_SEED` is one of its instructions, drawn from the seed: the scripted expert
     carries out those before it, unseen, and the episode begins where it stopped. A demonstration thus has one
