@@ -448,13 +448,6 @@ class Exporter(Protocol):
         """
 
 
-class PolicyExporter(Protocol):
-    """Writer of policies in another format."""
-
-    def export_policy(self, policy: Any) -> Any:
-        """Write a `vla.policy.Policy`; returns the path of the export."""
-
-
 class Deployment(Protocol):
     """Execution of a policy outside training; built as `Deployment(**yaml, policy=…, environment=…, output=…)`.
 

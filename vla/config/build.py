@@ -81,7 +81,7 @@ GROUPS = {
         Group("policy", ("vla.policy.Policy",), ("model", "spec")),
         Group("agent", ("vla.spec.Agent",), ("spec",), optional=True),
         Group("recorder", ("vla.spec.Recorder",), ("folder",), optional=True),
-        Group("export", ("vla.spec.Exporter", "vla.spec.PolicyExporter")),
+        Group("export", ("vla.spec.Exporter",)),
         Group("deploy", ("vla.spec.Deployment",), ("policy", "environment", "output")),
     )
 }

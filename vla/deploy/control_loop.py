@@ -71,11 +71,6 @@ class ControlLoop:
         self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
         self._timed_out = False  # True if the loop is stopped by a time-out
 
-    def limit(self, limits: JointLimits) -> None:
-        """Replace the limits."""
-        self.limits = limits
-        self.motion.set_limits(limits)
-
     def on_image(self, camera: str, image: Array, at: float) -> None:
         """Add an image (H, W, 3) uint8 that was taken at `at`."""
         self._observer.add_image(camera, image, at)

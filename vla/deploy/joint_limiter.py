@@ -136,7 +136,6 @@ class JointLimiter:
     def _move(self, velocity: Array) -> Array:
         change = self.limits.max_acceleration * self._period
         velocity = np.clip(velocity, -self.limits.max_speed, self.limits.max_speed)
-        # After the speed limit, which may have been lowered in motion: the acceleration limit has priority.
         velocity = np.clip(velocity, self.velocity - change, self.velocity + change)
         # Keep the braking distance within the position limits.
         up = self._stoppable(self.limits.max_position - self.position)

@@ -67,23 +67,17 @@ def shorten(text: str, longest: int = 80) -> str:
 
 
 def image_from(message: Any) -> Array:
-    """Read the (H, W, 3) uint8 RGB image of a sensor_msgs/Image or CompressedImage.
-
-    Raises:
-        UserError: the encoding is not supported, or the size is zero or does not match the data.
-    """
+    """Read the (H, W, 3) uint8 RGB image of a sensor_msgs/Image or CompressedImage; a UserError if it is none."""
     if hasattr(message, "format"):
         return _decompressed(message)
     if message.encoding not in ENCODINGS:
         raise UserError(f"image encoding is {shorten(message.encoding)!r}, expected one of {', '.join(ENCODINGS)}")
     depth, order = ENCODINGS[message.encoding]
     height, width, step = message.height, message.width, message.step
-    if not height or not width:
-        raise UserError(f"image is {width} by {height} pixels")
-    if step < width * depth:
-        raise UserError(f"image step is {step} bytes, {width} pixels of {message.encoding} need {width * depth}")
-    if len(message.data) != step * height:
-        raise UserError(f"image has {len(message.data)} bytes, {height} rows of {step} are {step * height}")
+    if not height or not width or step < width * depth or len(message.data) != step * height:
+        raise UserError(
+            f"image of {width} by {height} pixels of {message.encoding} has {len(message.data)} bytes in rows of {step}"
+        )
     rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, : width * depth]
     return np.ascontiguousarray(rows.reshape(height, width, depth)[..., order])
 
@@ -103,8 +97,7 @@ def _decompressed(message: Any) -> Array:
 def fill_image(message: Any, image: Array, frame: str) -> Any:
     """Fill a sensor_msgs/Image with an (H, W, 3) uint8 RGB image; returns the message."""
     message.height, message.width = image.shape[:2]
-    message.encoding, message.step = "rgb8", 3 * image.shape[1]
-    message.header.frame_id = frame
+    message.encoding, message.step, message.header.frame_id = "rgb8", 3 * image.shape[1], frame
     message.data = image.tobytes()  # a numpy array would be checked item by item
     return message
 
@@ -143,11 +136,10 @@ class JointStates:
 def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
     """Read positions and velocities of some joints, by name."""
     names = list(message.name)
-    if len(set(names)) != len(names):
-        raise UserError("joint state names a joint twice")
-    missing = [name for name in joints if name not in names]
-    if missing:
-        raise UserError(f"joint state lacks {', '.join(missing)}; it has {', '.join(names) or 'no names'}")
+    if missing := [name for name in joints if names.count(name) != 1]:
+        raise UserError(
+            f"joint state lacks {', '.join(missing)}, or has it twice; it has {', '.join(names) or 'nothing'}"
+        )
     if len(message.position) != len(names) or len(message.velocity) not in (0, len(names)):
         raise UserError(
             f"joint state has {len(names)} names, {len(message.position)} positions, {len(message.velocity)} velocities"

@@ -114,12 +114,6 @@ class Goals:
         goals = [self._controller.step(action).copy() for action in actions]
         return list(zip(ends.tolist(), goals, openings, strict=True))
 
-    def tool_velocity(self, command: Command) -> Array:
-        """Return the (6,) velocity of the tool [m/s], [rad/s] in the base frame, of a command of Cartesian actions."""
-        assert isinstance(self._controller, CartesianController)
-        _, jacobian = self._controller.arm.forward(command.position)
-        return jacobian @ command.velocity
-
 
 class Motion:
     """The commanded state of an arm: it moves along a schedule, and brakes without one."""
@@ -159,10 +153,6 @@ class Motion:
         self.schedule, self._sent_valid = Schedule[Waypoint](self._period), False
         if plan:
             self.schedule.add(plan, plan[0][0] - self._period)
-
-    def set_limits(self, limits: JointLimits) -> None:
-        """Replace the limits."""
-        self.limiter.limits, self._sent_valid = limits, False
 
     def commanded_at(self, at: float) -> Array:
         """Return the joints (J,) that were commanded nearest to a time."""

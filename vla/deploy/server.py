@@ -1,11 +1,9 @@
-"""A policy server that speaks openpi's protocol, for any client that does.
+"""A policy server that speaks openpi's protocol (openpi, src/openpi/serving/websocket_policy_server.py).
 
-Over a WebSocket without compression the server first sends its metadata, then one map with `actions` (k, D) for every
-observation of the client, all in the encoding of `vla.io.array_messages`. An error is sent as text and closes the
-connection. `GET /healthz` answers OK (openpi, src/openpi/serving/websocket_policy_server.py).
-
-Beyond that protocol, the metadata describe actions, state and images, and the message {"reset": True, "prompt": …,
-"seed": …} starts an episode: it clears the history of the connection and seeds the noise of the model.
+Over a WebSocket without compression it first sends its metadata, then one map with `actions` (k, D) for every
+observation, all in the encoding of `vla.io.array_messages`. An error is sent as text and closes the connection.
+`GET /healthz` answers OK. Beyond that protocol, the message {"reset": True, "prompt": …, "seed": …} starts an episode:
+it clears the history of the connection and seeds the noise of the model.
 """
 
 from __future__ import annotations
@@ -142,11 +140,9 @@ class Service:
     async def _listening(self) -> AsyncIterator[str]:
         """Serve within the context, which is entered with the URL once the first client can be answered."""
         settings, policy = self._settings, self._policy
-        options: dict[str, Any] = {
-            **{"compression": None, "max_size": settings.largest_message, "max_queue": 1},
-            **{"origins": [None, *settings.origins], "process_request": self._answer_request},  # programs send none
-            **{"open_timeout": PATIENCE, "close_timeout": PATIENCE},
-        }
+        options: dict[str, Any] = {"compression": None, "max_size": settings.largest_message, "max_queue": 1}
+        options |= {"origins": [None, *settings.origins], "process_request": self._answer_request}  # programs have none
+        options |= {"open_timeout": PATIENCE, "close_timeout": PATIENCE}
         with ThreadPoolExecutor(1, "inference") as thread:
             # The first pass through a compiled model takes up to a minute.
             noise = policy.spec.random_observation(np.random.default_rng(0))
@@ -162,8 +158,9 @@ class Service:
         if request.path == "/healthz":
             return connection.respond(HTTPStatus.OK, "OK\n")
         key, given = self._settings.api_key, "".join(request.headers.get_all("Authorization"))
-        wanted = f"Api-Key {key}".encode()
-        if key is not None and not hmac.compare_digest(given.encode(errors="surrogateescape"), wanted):
+        if key is not None and not hmac.compare_digest(
+            given.encode(errors="surrogateescape"), f"Api-Key {key}".encode()
+        ):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "send the API key as Authorization: Api-Key …\n")
         if len(self._lanes) >= self._settings.connections:
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{len(self._lanes)} clients are connected\n")
@@ -233,7 +230,6 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
     `history` of several frames wants to see every frame, so that the client sends an observation at every step.
     """
     spec = policy.spec
-    action = {"names": list(spec.action), "units": list(spec.units)}
     bounds = {"low": np.array(spec.low, np.float32), "high": np.array(spec.high, np.float32)}
     return {
         "server": "vla",
@@ -241,7 +237,7 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
         "images": {keys.images[camera]: [*spec.image_size, 3] for camera in spec.cameras},
         "state": {"keys": keys.state, "names": list(spec.state), "units": list(spec.state_units)},
         "prompt": keys.prompt,
-        "action": {**action, **bounds},
+        "action": {"names": list(spec.action), "units": list(spec.units), **bounds},
         "control_hz": spec.control_hz,
         "horizon": policy.model.chunk,
         "execute": policy.execute,

@@ -1,4 +1,4 @@
-"""`job=export`: export the demonstrations to another format, or a trained policy to programs."""
+"""`job=export`: export the demonstrations to another format."""
 
 from __future__ import annotations
 
@@ -11,13 +11,6 @@ log = logging.getLogger(__name__)
 
 
 def run(experiment: Experiment) -> None:
-    """Export demonstrations or a policy, depending on the exporter.
-
-    Raises:
-        UserError: the exporter needs a policy, and no checkpoint is given.
-    """
+    """Export demonstrations."""
     exporter = experiment.build("export")
-    if hasattr(exporter, "export_policy"):
-        log.info("wrote %s", exporter.export_policy(experiment.make_policy()()))
-    else:
-        log.info("wrote %s", exporter.export(demonstrations(experiment), experiment.cluster()))
+    log.info("wrote %s", exporter.export(demonstrations(experiment), experiment.cluster()))

@@ -24,6 +24,7 @@ OUTLIER_QUANTILES = (0.01, 0.99)
 OUTLIER_MARGIN = 0.5  # by which bounds exceed the quantiles, as a fraction of the distance between these
 # Distance between the quantiles, as a fraction of the range, below which rare values are no outliers.
 RARE_EVENT_SPREAD = 0.02
+BOUNDS_TOLERANCE = 1e-3  # of the bounds of actions, as a fraction of their range
 
 
 @dataclass(frozen=True)
@@ -103,3 +104,25 @@ def action_bounds(values: Array) -> tuple[float, float]:
         least, most = max(least, low - OUTLIER_MARGIN * (high - low)), min(most, high + OUTLIER_MARGIN * (high - low))
     apart = 1e-3 * max(1.0, abs(least)) if least == most else 0.0
     return least - apart, most + apart
+
+
+def out_of_bounds(actions: Array, spec: Spec, most: float) -> list[str]:
+    """Describe the components of which more than the share `most` of the (N, D) actions exceeds the bounds of a spec:
+    they have other units."""
+    found = list[str]()
+    for index, (name, low, high) in enumerate(zip(spec.action, spec.low, spec.high, strict=True)):
+        values, slack = actions[:, index], BOUNDS_TOLERANCE * (high - low)
+        if (beyond := ((values < low - slack) | (values > high + slack)).mean()) > most:
+            unit = "" if spec.units[index] == "1" else f" {spec.units[index]}"
+            found.append(
+                f"{name} in action from {values.min():.3g} to {values.max():.3g}, the task has {low:g} to {high:g}"
+                f"{unit}, beyond which are {beyond:.0%} (other units, or absolute?)"
+            )
+    return found
+
+
+def log_clipped(actions: Array, spec: Spec) -> None:
+    """Log how many of the (N, D) actions are clipped to the bounds of a spec."""
+    clipped = np.clip(actions, np.array(spec.low, np.float32), np.array(spec.high, np.float32))
+    if share := float((clipped != actions).mean()):
+        log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * share)

@@ -73,7 +73,7 @@ def deploy(experiment: Experiment) -> dict[str, Measure]:
         operator.begin_episode()
         delays = [1000 * operator.watchdog_delay() for _ in range(experiment.options(Benchmark).episodes)]
         image, inference, tick = (
-            parse_json(operator.status.get(key, ""), float, f"{key} of /vla_agent/status")
+            parse_json(operator.values.get(key, ""), float, f"{key} of /vla_agent/status")
             for key in ("image to command p50 [ms]", "inference p50 [ms]", "tick p99 [ms]")
         )
     agent = experiment["deploy"]["agent"]
