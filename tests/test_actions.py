@@ -270,7 +270,7 @@ def test_what_goals_command_is_recorded_and_imported(make_world: Callable[..., W
     world.live(1.2)
     recorder.close()
     topics = replace(TOPICS, commands="/vla_agent/commands", gripper=None)
-    imported = BagDemonstrations(tmp_path / "bag", "all", topics, ROBOT, spec=SPEC)
+    imported = BagDemonstrations(tmp_path / "bag", topics, ROBOT, spec=SPEC)
     (episode,) = map(imported.episode, range(len(imported)))
     places = [forward(np.array(command.position[:7]))[0][0, 3] for command in world.commands]
     assert len(episode.actions) > 5 and np.abs(episode.actions[:, 1:6]).max() < 1e-3

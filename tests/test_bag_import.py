@@ -29,9 +29,9 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bags.write(tmp_path_factory.mktemp("bags") / "bag")
 
 
-def imported(folder: Path, steps: Any = "corrected", spec: Any = SPEC, **changed: Any) -> BagDemonstrations:
+def imported(folder: Path, spec: Any = SPEC, **changed: Any) -> BagDemonstrations:
     options: dict[str, Any] = {"topics": TOPICS, "robot": ROBOT, **changed}
-    return BagDemonstrations(folder, steps, **options, spec=spec)
+    return BagDemonstrations(folder, **options, spec=spec)
 
 
 def brightness(episode: Episode) -> list[int]:
@@ -39,40 +39,34 @@ def brightness(episode: Episode) -> list[int]:
     return [int(seen.rgb["front"].mean()) // 3 for seen in episode.observations]
 
 
-def test_what_a_person_did_is_an_episode_from_the_first_motion_to_the_last(bag: Path) -> None:
+def test_an_episode_is_what_was_done_for_an_instruction_by_the_policy_or_a_person(bag: Path) -> None:
     demonstrations = imported(bag)
-    assert len(demonstrations) == 1
-    episode = demonstrations.episode(0)
-    assert episode.instruction == "put the red block on the pad" and episode.outcome == "unverified"
-    numbers = brightness(episode)
-    assert numbers == list(range(numbers[0], numbers[-1] + 1))
-    assert 32 <= numbers[0] <= 33 and 44 <= numbers[-1] <= 46  # of the 33 … 44 in which the person moved the arm
-    assert episode.draws["recorded"]["person"]
-    first = numbers.index(33)
-    np.testing.assert_allclose(episode.actions[first : first + 12], bags.executed((4,)), atol=2e-4)
-    assert episode.actions.dtype == np.float32 and (episode.actions[first:, 6] == 0).all()
-
-
-def test_everything_that_was_done_is_an_episode_per_instruction_and_hand(bag: Path) -> None:
-    demonstrations = imported(bag, "all")
     episodes = [demonstrations.episode(number) for number in range(len(demonstrations))]
     words = ["put the red block on the pad"] * 3 + ["lift the blue block"]
     assert [episode.instruction for episode in episodes] == words
     assert [episode.draws["recorded"]["person"] for episode in episodes] == [False, True, False, False]
+    assert {episode.outcome for episode in episodes} == {"unverified"}
     np.testing.assert_allclose(episodes[0].actions[:18], bags.executed((1,))[:18], atol=2e-4)
     state = episodes[0].observations[0].state
     assert state[14] == pytest.approx(0.08) and np.abs(state[:7] - bags.HOME).max() < 0.05
     assert [seen.instruction for seen in episodes[3].observations] == ["lift the blue block"] * 6
+    person = episodes[1]  # from the first motion to the last
+    numbers = brightness(person)
+    assert numbers == list(range(numbers[0], numbers[-1] + 1))
+    assert 32 <= numbers[0] <= 33 and 44 <= numbers[-1] <= 46  # of the 33 … 44 in which the person moved the arm
+    first = numbers.index(33)
+    np.testing.assert_allclose(person.actions[first : first + 12], bags.executed((4,)), atol=2e-4)
+    assert person.actions.dtype == np.float32 and (person.actions[first:, 6] == 0).all()
 
 
 def test_an_arm_that_is_guided_by_hand_moves_as_measured(tmp_path: Path) -> None:
     parts = (
-        bags.Part("running", bags.moving(5, 0), instruction="lift it"),
+        bags.Part("running", bags.moving(6, 0), instruction="lift it"),
         bags.Part("handed over", bags.moving(10, 1, gripper=0.0), person=True, commands=False),
         bags.Part("holding", np.repeat(bags.RESTING, 3, 0)),
     )
-    episode = imported(bags.write(tmp_path / "bag", parts)).episode(0)
-    first = brightness(episode).index(6)
+    episode = imported(bags.write(tmp_path / "bag", parts)).episode(1)
+    first = brightness(episode).index(7)
     np.testing.assert_allclose(episode.actions[first : first + 8, :6], bags.moving(8, 1)[:, :6], atol=2e-4)
     assert (episode.actions[first : first + 8, 6] == 0).all()  # as measured, not as the policy last commanded
 
@@ -99,8 +93,8 @@ def test_joint_positions_of_any_robot_are_learned_from_a_bag_alone(bag: Path) ->
     spec = build(config["task"], "task").spec
     assert (spec.control_hz, spec.cameras, spec.action) == (10.0, ("front", "wrist"), tuple(ROBOT.joints))
     demonstrations = build(config["expert"], "expert", spec=spec)
-    assert len(demonstrations) == config["collect"]["episodes"] == 1
-    episode = demonstrations.episode(0)
+    assert len(demonstrations) == config["collect"]["episodes"] == 4
+    episode = demonstrations.episode(1)
     states = [seen.state for seen in episode.observations]
     np.testing.assert_allclose(episode.actions[:-1], states[1:], atol=0.01)
     assert np.abs(np.diff(episode.actions, axis=0)).sum() > 0.05
@@ -145,15 +139,8 @@ def test_images_of_another_kind_are_refused(tmp_path: Path, monkeypatch: pytest.
 def test_the_bags_in_a_folder_are_imported_in_order(tmp_path: Path) -> None:
     for name, words in (("first", "lift it"), ("second", "put it down")):
         bags.write(tmp_path / name, [bags.Part("running", bags.moving(10, 0), instruction=words)])
-    demonstrations = imported(tmp_path, "all")
+    demonstrations = imported(tmp_path)
     assert [demonstrations.episode(number).instruction for number in (0, 1)] == ["lift it", "put it down"]
-
-
-def test_without_a_correction_there_is_nothing_to_import_but_what_the_policy_did(tmp_path: Path) -> None:
-    bag = bags.write(tmp_path / "bag", bags.SESSION[-2:])
-    with pytest.raises(ValueError, match=r"in the hand of a person: expert\.steps=all"):
-        imported(bag)
-    assert len(imported(bag, "all")) == 1
 
 
 @pytest.mark.parametrize("name", ["bag.mcap", "metadata.yaml"])
@@ -174,7 +161,7 @@ def test_a_damaged_bag_is_imported_or_refused_in_a_sentence(tmp_path: Path, name
             changed[place] ^= 1 << generator.randrange(8)
         (whole / name).write_bytes(changed)
         try:
-            demonstrations = imported(whole, "all")
+            demonstrations = imported(whole)
             for number in range(len(demonstrations)):
                 assert np.isfinite(demonstrations.episode(number).actions).all()
         except ValueError as error:

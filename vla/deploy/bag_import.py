@@ -9,9 +9,10 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from itertools import pairwise
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,6 +37,9 @@ LEAD = 0.1  # of a person's motion that are kept before it begins and after it e
 SHORTEST = 0.5  # shorter segments are left out [s]
 MOSTLY = 0.5  # largest share of a component's actions beyond its bounds; a larger one means other units
 
+Track = list[tuple[float, Array]]  # positions over time
+WHEN = itemgetter(0)
+
 
 class _Picture(NamedTuple):
     """An image, which is read again when it is needed."""
@@ -44,46 +48,21 @@ class _Picture(NamedTuple):
     taken: float
 
 
-class _Following(NamedTuple):
-    """What an arm is moved for: an instruction, and whether by a person."""
+class _Segment(NamedTuple):
+    """A time in which one instruction was followed, by the policy or a person."""
 
-    number: int  # of the instruction
     instruction: str
     person: bool
-
-
-class _Segment(NamedTuple):
-    """A time in which one instruction was followed."""
-
-    what: _Following
     start: float
     end: float
 
 
-class _Track:
-    """Positions over time."""
+class _Step(NamedTuple):
+    """One step of an episode, without its images."""
 
-    def __init__(self) -> None:
-        self.times: list[float] = []
-        self.values: list[Any] = []  # arrays (J,), or numbers
-
-    def add(self, at: float, value: Any) -> None:
-        """Add the next value."""
-        self.times.append(at)
-        self.values.append(value)
-
-    def covers(self, at: float) -> bool:
-        """Return whether there are values shortly before and shortly after `at`."""
-        place = bisect_right(self.times, at)
-        return 0 < place < len(self.times) and self.times[place] - self.times[place - 1] <= GAP
-
-    def between(self, at: float) -> Any:
-        """Interpolate linearly."""
-        after = min(bisect_left(self.times, at), len(self.times) - 1)
-        before = max(after - 1, 0)
-        span = max(self.times[after] - self.times[before], 1e-9)
-        share = min(max((at - self.times[before]) / span, 0.0), 1.0)
-        return self.values[before] + share * (self.values[after] - self.values[before])
+    taken: float
+    arrivals: dict[str, float]  # of its images
+    state: Array  # (P,) float32
 
 
 class _Bag:
@@ -92,9 +71,10 @@ class _Bag:
     def __init__(self, folder: Path, topics: Topics, limits: JointLimits) -> None:
         self.folder, self._limits, self._joint_states = folder, limits, messages.JointStates(limits)
         self.inputs: list[tuple[float, _Picture | Measured]] = []  # when they arrived
-        self.joints, self.openings = _Track(), _Track()  # measured (J,) [rad] and [m]
-        self.commands, self.gripper_commands = _Track(), _Track()  # (J,) [rad], and openings 0 … 1
-        self._following: list[_Following | None] = []  # at every joint state; None: nobody moves the arm
+        self.measured: Track = []  # joints (J,) [rad] and opening [m], together (J + 1,)
+        self.commands: Track = []  # (J,) [rad]
+        self.openings: Track = []  # commanded, 0 … 1
+        self._followed: list[tuple[int, str, bool] | None] = []  # at every joint state: instruction, person; or nothing
         self._instruction, self._said_at, self._number = "", -np.inf, 0
         self._used, self._dropped = set[str](), dict[str, str]()  # topics; topic → why its first message is unusable
         with opened(folder) as reader:
@@ -132,23 +112,18 @@ class _Bag:
                 why = self._dropped.get(topic, "there are no messages")
                 raise UserError(f"{self.folder}: no message on {topic} can be used: {why}")
 
-    def segments(self, all_steps: bool) -> Iterator[_Segment]:
-        """Yield the times in which an instruction was followed: those of a person, from motion to rest, or all."""
-        changes = [at for at, (a, b) in enumerate(pairwise(self._following), 1) if a != b]
-        for first, stop in pairwise([0, *changes, len(self._following)]):
-            what, times = self._following[first], self.joints.times[first:stop]
-            if what is None or not (what.person or all_steps):
-                continue
+    def segments(self) -> Iterator[_Segment]:
+        """Yield the times in which an instruction was followed; those of a person from motion to rest."""
+        for what, group in groupby(zip(self._followed, self.measured, strict=True), key=itemgetter(0)):
+            times, positions = zip(*(measured for _, measured in group), strict=True)
             start, end = times[0], times[-1]
-            if what.person:
-                at = np.column_stack([self.joints.values[first:stop], self.openings.values[first:stop]])
-                scaled = at / [*[STILL] * len(self._limits.joints), STILL_OPENING]
-                away = [np.flatnonzero(np.abs(scaled - rest).max(1) > 1) for rest in (scaled[0], scaled[-1])]
-                if not len(away[0]):
-                    continue  # the person did not move it
-                start, end = max(times[away[0][0]] - LEAD, start), min(times[away[1][-1]] + LEAD, end)
-            if end - start >= SHORTEST:
-                yield _Segment(what, start, end)
+            if what is not None and what[2]:
+                scaled = np.array(positions) / [*[STILL] * len(self._limits.joints), STILL_OPENING]
+                began, ceased = (np.flatnonzero(np.abs(scaled - scaled[at]).max(1) > 1) for at in (0, -1))
+                start = max(times[began[0]] - LEAD, start) if len(began) else end
+                end = min(times[ceased[-1]] + LEAD, end) if len(ceased) else start
+            if what is not None and end - start >= SHORTEST:
+                yield _Segment(what[1], what[2], start, end)
 
     def _see(self, camera: str, at: float, message: Any) -> None:
         if not hasattr(message, "format"):
@@ -160,10 +135,9 @@ class _Bag:
         if (measured := self._joint_states.read(message, at)) is None:
             raise UserError("they hold the fingers alone")
         self.inputs.append((at, Measured(at, *measured)))
-        self.joints.add(at, measured[0])
-        self.openings.add(at, measured[2])
+        self.measured.append((at, np.append(measured[0], measured[2])))
         moved = self._instruction and self._person is not None
-        self._following.append(_Following(self._number, self._instruction, bool(self._person)) if moved else None)
+        self._followed.append((self._number, self._instruction, bool(self._person)) if moved else None)
 
     def _instruct(self, at: float, message: Any) -> None:
         said = message.data.strip()[:LONGEST_INSTRUCTION]
@@ -176,7 +150,7 @@ class _Bag:
         self._person = True if values.get(messages.HANDED_OVER) == "yes" else running
 
     def _command(self, at: float, message: Any) -> None:
-        """Add a command; one without joint positions, a twist, is dropped: actions follow the measured motion."""
+        """Add a command; one without joint positions is dropped: actions follow the measured motion."""
         if hasattr(message, "points"):  # the node replaces all points after the first by its next trajectory
             names, positions = message.joint_names, message.points[0].positions if message.points else ()
         elif hasattr(message, "data"):
@@ -184,36 +158,27 @@ class _Bag:
         else:
             names, positions = message.name, message.position
         joints, opening = messages.command_from(names, positions, self._limits)
-        self.commands.add(at, joints)
+        self.commands.append((at, joints))
         if opening is not None:
-            self.gripper_commands.add(at, opening)
+            self.openings.append((at, np.array(opening)))
 
     def _command_fingers(self, at: float, message: Any) -> None:
         if not len(message.data) or not np.isfinite(message.data).all():
             raise UserError("finger positions that are not finite")
-        self.gripper_commands.add(at, float(np.mean(message.data)) / self._limits.finger_travel)
-
-
-class _Step(NamedTuple):
-    """One step of an episode, without its images."""
-
-    taken: float
-    arrivals: dict[str, float]  # of its images
-    state: Array  # (P,) float32
+        self.openings.append((at, np.mean(message.data) / self._limits.finger_travel))
 
 
 class BagDemonstrations(imported.ImportedDemonstrations):
     """Episodes of bags, at the control rate of the task, with the observations that the policy node makes of them.
 
     An episode is a time in which one instruction was followed, by the policy, or by a person to whom the arm was handed
-    over, from motion to rest. Without the topic of the node's status a person always moves the arm. The action of a
-    step is the motion that was commanded for one control period; where none was, as when an arm is guided by hand, the
-    measured one. Actions beyond the bounds of the task are clipped, depth is 0 (no return). Whether an episode
-    succeeded is not known: its outcome is "unverified".
+    over, from motion to rest; `recorded.person` in its draws tells which. Without the topic of the node's status a
+    person always moves the arm. The action of a step is the motion that was commanded for one control period; where
+    none was, as when an arm is guided by hand, the measured one. Actions beyond the bounds of the task are clipped,
+    depth is 0 (no return). Whether an episode succeeded is not known: its outcome is "unverified".
 
     Args:
         folder: of a bag, or of a folder of bags.
-        steps: "corrected": what a person did; "all": also what the policy did.
         topics: in the bags.
         robot: names of the joints, and travel of the fingers.
         spec: of the task.
@@ -222,15 +187,7 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         UserError: a bag is missing, damaged or incomplete, lacks topics, or is of another robot.
     """
 
-    def __init__(
-        self,
-        folder: Path | str | None,
-        steps: Literal["corrected", "all"],
-        topics: Topics,
-        robot: JointLimits,
-        *,
-        spec: Spec,
-    ) -> None:
+    def __init__(self, folder: Path | str | None, topics: Topics, robot: JointLimits, *, spec: Spec) -> None:
         self.spec, self._limits = spec.without_truth, robot
         model = spec.require_robot("expert=bag")
         if len(robot.joints) != len(model.joints):
@@ -242,10 +199,10 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         bags = _read_bags(folder, topics, robot)
         for bag in bags:
             bag.require(*self._cameras)
-        self._episodes = [(bag, segment, self._steps(bag, segment)) for bag, segment in _chosen(bags, steps)]
+        self._episodes = [(bag, segment, self._steps(bag, segment)) for bag, segment in _segments(bags)]
         self._actions = [
-            np.array([self._action(bag, segment, step.taken) for step in taken])
-            for bag, segment, taken in self._episodes
+            np.array([self._action(bag, segment, step.taken) for step in steps])
+            for bag, segment, steps in self._episodes
         ]
         actions = np.concatenate(self._actions)
         if wrong := imported.out_of_bounds(actions, spec, MOSTLY):
@@ -254,22 +211,21 @@ class BagDemonstrations(imported.ImportedDemonstrations):
 
     @classmethod
     def recording(
-        cls, folder: Path | str | None, steps: str, topics: Mapping[str, Any], robot: Mapping[str, Any]
+        cls, folder: Path | str | None, topics: Mapping[str, Any], robot: Mapping[str, Any]
     ) -> imported.Recording:
         """Describe bags: their state and action are the joints, see `ImportedDemonstrations.recording`."""
         named = Topics(**{name: value for name, value in topics.items() if name != "_target_"})
         limits = JointLimits(**{name: value for name, value in robot.items() if name != "_target_"})
-        bags = _read_bags(folder, named, limits)
+        bags, joints = _read_bags(folder, named, limits), tuple(limits.joints)
         cameras = tuple(camera for camera, topic in named.images.items() if topic in bags[0].kinds)
         bags[0].require(named.images[cameras[0]] if cameras else next(iter(named.images.values())))
-        tracks = [bag.commands if bag.commands.times else bag.joints for bag in bags]
-        values = np.concatenate([track.values for track in tracks]).T
-        bounds = {name: imported.action_bounds(each) for name, each in zip(limits.joints, values, strict=True)}
+        values = np.array([value[: len(joints)] for bag in bags for _, value in bag.commands or bag.measured]).T
+        bounds = {name: imported.action_bounds(each) for name, each in zip(joints, values, strict=True)}
         pictures = (each for _, each in bags[0].inputs if isinstance(each, _Picture))
         taken = [each.taken for each in pictures if each.camera == cameras[0]]
         period = float(np.median(np.diff(taken))) if len(taken) > 1 else 0.0
-        rate, joints = round(1 / period, 1) if period > 0 else 1.0, tuple(limits.joints)
-        return imported.Recording(cameras, rate, joints, joints, bounds, len(_chosen(bags, steps)))
+        rate = round(1 / period, 1) if period > 0 else 1.0
+        return imported.Recording(cameras, rate, joints, joints, bounds, len(_segments(bags)))
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -277,27 +233,23 @@ class BagDemonstrations(imported.ImportedDemonstrations):
 
     def episode(self, number: int) -> Episode:
         """Return one episode, with its images; raise a UserError if they are damaged."""
-        spec, (bag, (what, *_), steps) = self.spec, self._episodes[number]
-        images, depth = (
-            self._images(bag, steps),
-            {camera: np.zeros(spec.image_size, np.uint16) for camera in spec.depth},
-        )
+        spec, (bag, segment, steps) = self.spec, self._episodes[number]
+        words, depth = segment.instruction, {camera: np.zeros(spec.image_size, np.uint16) for camera in spec.depth}
+        images = self._images(bag, steps)
         observations = [
-            Observation(
-                {place[0]: images[place] for place in step.arrivals.items()}, step.state, what.instruction, depth
-            )
+            Observation({camera: images[camera, at] for camera, at in step.arrivals.items()}, step.state, words, depth)
             for step in steps
         ]
         actions = np.clip(self._actions[number], spec.low, spec.high).astype(np.float32)
-        recorded = {"episode": number, "person": what.person, "lacks": ["depth"] if spec.depth else []}
-        facts = (number, "recorded", what.instruction, "unverified", frozenset[str](), {"recorded": recorded})
+        recorded = {"episode": number, "person": segment.person, "lacks": ["depth"] if spec.depth else []}
+        facts = (number, "recorded", words, "unverified", frozenset[str](), {"recorded": recorded})
         return Episode(*facts, observations, actions, actions)
 
     def _steps(self, bag: _Bag, segment: _Segment) -> list[_Step]:
         """Return the steps of a segment, made as the policy node makes its observations; a UserError without any."""
         observer, steps, period = Observer(self.spec), list[_Step](), 1 / self.spec.control_hz
-        times, last = [at for at, _ in bag.inputs], -np.inf
-        first, stop = bisect_left(times, segment.start - HISTORY), bisect_right(times, segment.end)
+        first = bisect_left(bag.inputs, segment.start - HISTORY, key=WHEN)
+        last, stop = -np.inf, bisect_right(bag.inputs, segment.end, key=WHEN)
         for now, each in bag.inputs[first:stop]:
             if isinstance(each, Measured):
                 observer.add_joint_state(each)
@@ -313,7 +265,7 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         if not steps:
             raise UserError(
                 f"{bag.folder} has no matching images of {', '.join(self.spec.cameras)} from {segment.start:.1f} to "
-                f"{segment.end:.1f} s, in '{messages.shorten(segment.what.instruction)}'"
+                f"{segment.end:.1f} s, in '{messages.shorten(segment.instruction)}'"
             )
         return steps
 
@@ -333,16 +285,28 @@ class BagDemonstrations(imported.ImportedDemonstrations):
 
     def _action(self, bag: _Bag, segment: _Segment, at: float) -> Array:
         """Return the (D,) motion from `at` over one control period."""
-        end, gripper = at + 1 / self.spec.control_hz, bag.gripper_commands
-        track = bag.commands if bag.commands.covers(at) and bag.commands.covers(end) else bag.joints
-        motion = self._controller.motion_between(track.between(at), track.between(end))
+        end, joints = at + 1 / self.spec.control_hz, len(self._limits.joints)
+        track = bag.commands if _covers(bag.commands, at) and _covers(bag.commands, end) else bag.measured
+        motion = self._controller.motion_between(*(_between(track, when)[:joints] for when in (at, end)))
         if self._gripper is None:
             return motion
-        newest = bisect_right(gripper.times, end)
-        # A command of before is the policy's, not the person's.
-        if newest and gripper.times[newest - 1] >= segment.start:
-            return np.insert(motion, self._gripper, gripper.values[newest - 1])
-        return np.insert(motion, self._gripper, bag.openings.between(end) / self._limits.stroke)
+        told = bag.openings[: bisect_right(bag.openings, end, key=WHEN)][-1:]
+        if told and told[0][0] >= segment.start:  # a command of before is the policy's, not the person's
+            return np.insert(motion, self._gripper, told[0][1])
+        return np.insert(motion, self._gripper, _between(bag.measured, end)[joints] / self._limits.stroke)
+
+
+def _covers(track: Track, at: float) -> bool:
+    """Return whether there are positions shortly before and shortly after `at`."""
+    place = bisect_right(track, at, key=WHEN)
+    return 0 < place < len(track) and track[place][0] - track[place - 1][0] <= GAP
+
+
+def _between(track: Track, at: float) -> Array:
+    """Interpolate linearly."""
+    after = min(bisect_left(track, at, key=WHEN), len(track) - 1)
+    (begin, start), (end, stop) = track[max(after - 1, 0)], track[after]
+    return start + min(max((at - begin) / max(end - begin, 1e-9), 0.0), 1.0) * (stop - start)
 
 
 def _read_bags(folder: Path | str | None, topics: Topics, limits: JointLimits) -> list[_Bag]:
@@ -352,9 +316,8 @@ def _read_bags(folder: Path | str | None, topics: Topics, limits: JointLimits) -
     return [_Bag(each, topics, limits) for each in inside or [Path(folder)]]
 
 
-def _chosen(bags: Sequence[_Bag], steps: str) -> list[tuple[_Bag, _Segment]]:
+def _segments(bags: Sequence[_Bag]) -> list[tuple[_Bag, _Segment]]:
     """Return the segments that are episodes; a UserError if there are none."""
-    if found := [(bag, segment) for bag in bags for segment in bag.segments(steps == "all")]:
+    if found := [(bag, segment) for bag in bags for segment in bag.segments()]:
         return found
-    person = " in the hand of a person: expert.steps=all also takes what the policy did" if steps == "corrected" else ""
-    raise UserError(f"{bags[0].folder} has no instruction that an arm followed{person}")
+    raise UserError(f"{bags[0].folder} has no instruction that an arm followed")
