@@ -392,22 +392,14 @@ REFUSED: list[tuple[Change, str]] = [
     (told(codebase_version=["v3.0"] * 1000), r"has version \['v3\.0', .{1,12}, and v3\.0 is read here"),
     (info(lambda info: info.pop("features")), r"info\.json is damaged or of another kind: features: Field required"),
     (told(fps=0), r"fps: Input should be greater than 0"),
-    (told(features=feature("action", "x")), r"features\.action\.shape: Input should be"),
     (told(features=feature("action", [3], [5])), r"no vector observation\.state, it has act"),
-    (told(features=feature("a" * 10_000, [3])), r"no vector observation\.state, it has a{500}$"),
     (info(lambda info: info["features"]["action"].update(shape=[10**9])), "1000000000 components in action, the limit"),
     (info(drop), r"it has none at all; action of 6 numbers \(action_0, .*, the task has 3 \(x, y, grip"),
     (lambda dataset: (dataset / INFO).write_text('{"features": ' + "[" * 100_000), r"json is damaged or of .*: copy"),
     (lambda dataset: (dataset / INFO).write_text('{"codebase_version": '), r"copy the dataset again"),
-    (
-        without_second,
-        r"lists 2 of the 3 episodes that meta/info\.json counts: copy the dataset again .* or correct",
-    ),
+    (without_second, r"lists 2 of the 3 episodes that meta/info\.json counts: copy the dataset again .* or correct"),
     (told(total_frames=1000), r"lists \d+ of the 1000 frames that meta/info\.json counts: copy"),
-    (
-        rows(lambda table: table.slice(0, len(table) - 1)),
-        r"holds 10 of the 11 steps .* of episode 2: copy",
-    ),
+    (rows(lambda table: table.slice(0, len(table) - 1)), r"holds 10 of the 11 steps .* of episode 2: copy"),
     (
         rows(lambda table: pa.concat_tables([table, table.slice(0, 1)])),
         r"holds 13 of the 12 steps that meta/episodes counts of episode 0: correct",
@@ -421,19 +413,15 @@ REFUSED: list[tuple[Change, str]] = [
     (film(80, 16, 20), r"mp4 has 20 images per second, the dataset 10: encode the video again"),
     (column(TASKS, "task", None), "none of them task with texts: correct"),
     (column(TASKS, "task", "a" * 1001), "tasks of more than 1000 characters: 0"),
-    (column(TASKS, "task_index", "0"), "task_index does not hold integers"),
     (column(ROWS, "task_index", 7), r"tasks\.parquet lacks task 7, which episode 0 has: correct the dataset"),
     (column(EPISODES, f"{VIDEO}chunk_index", "../../x"), COUNT),
     (column(EPISODES, "episode_index", 1.5), COUNT),
     (column(EPISODES, "episode_index", 0), "lists episode 0 more than once: correct"),
     *((column(EPISODES, f"{VIDEO}from_timestamp", value), "hold seconds") for value in (NAN, -1e18, "0")),
-    *((column(ROWS, "action", value), NUMBERS) for value in ("push", ["a", "b", "c"])),
+    (column(ROWS, "action", "push"), NUMBERS),
     (column(ROWS, "action", [0.0, 0.0]), NO_NUMBERS),
     (column(ROWS, "episode_index", None), COUNT),
-    (
-        column(ROWS, "action", not_finite),
-        r"action is nan at index 1 in episode 1, step 3, the first of 2: correct",
-    ),
+    (column(ROWS, "action", not_finite), r"action is nan at index 1 in episode 1, step 3, the first of 2: correct"),
     (
         stamped(lambda times: times * 1.2),
         r"step 3 of episode 1 comes 0\.36 s after its first one, but at 10 Hz, .* 0\.3",
@@ -452,14 +440,6 @@ def test_what_is_wrong_with_a_dataset_is_said_before_anything_is_imported(
         demonstrations(changed(home, tmp_path / "dataset", change), ARM_SPEC)
     assert str(tmp_path) in str(caught.value) and len(str(caught.value)) < 2000
     assert "correct" not in says or "copy" in says or "copy the dataset" not in str(caught.value)
-
-
-def test_a_description_tells_what_is_wrong_too(home: Path, tmp_path: Path) -> None:
-    for name, change in (("half", without_second), ("numbers", column(ROWS, "action", not_finite))):
-        with pytest.raises(ValueError, match=r"lists 2 of the 3 episodes|is nan at index 1 in episode 1, step 3"):
-            recording(changed(home, tmp_path / name, change))
-    with pytest.raises(ValueError, match=r"expert\.folder=DIR"):
-        demonstrations(None, ARM_SPEC)
 
 
 def test_images_that_drift_away_from_their_steps_are_refused(tmp_path: Path) -> None:

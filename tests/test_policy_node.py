@@ -39,26 +39,21 @@ def world(make_world: Callable[..., World]) -> World:
     return world
 
 
-def test_the_first_command_is_the_measured_pose_and_the_arm_then_moves(world: World) -> None:
-    first = world.commands[0]
-    assert first.name == [*ROBOT.joints, *ROBOT.fingers]
-    np.testing.assert_allclose(first.position[:7], HOME)
-    assert list(first.velocity) == list(first.effort) == []
-    world.live(0.5)
-    steps = np.diff([command.position[:7] for command in world.commands], axis=0)
-    assert np.abs(steps).sum() > 0.1
-    assert (np.abs(steps) <= ROBOT.max_speed * 0.02 + 1e-9).all()
-    assert world.statuses[-1].level == DiagnosticStatus.OK
-
-
-def test_observations_are_those_of_the_messages(world: World) -> None:
-    seen = world.policy.seen[-1]
+def test_observations_are_those_of_the_messages_and_move_the_arm_from_its_measured_pose(world: World) -> None:
+    seen, first = world.policy.seen[-1], world.commands[0]
     assert seen.instruction == "put the red block on the pad" and set(seen.rgb) == {"front", "wrist"}
     assert seen.state[14] == pytest.approx(0.08) and seen.truth is None
     assert np.abs(seen.state[:7] - world.joints).max() < 0.2  # in the order of the spec, not of the message
+    assert first.name == [*ROBOT.joints, *ROBOT.fingers]
+    np.testing.assert_allclose(first.position[:7], HOME)
+    assert list(first.velocity) == list(first.effort) == []
     world.live(1.0)
+    steps = np.diff([command.position[:7] for command in world.commands], axis=0)
+    assert np.abs(steps).sum() > 0.1
+    assert (np.abs(steps) <= ROBOT.max_speed * 0.02 + 1e-9).all()
     status = {pair.key: pair.value for pair in world.statuses[-1].values}
     assert status["state"] == "running" and float(status["inference p99 [ms]"]) > 0
+    assert world.statuses[-1].level == DiagnosticStatus.OK
 
 
 def test_a_bug_in_a_callback_stops_the_arm_and_not_the_process(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,9 +98,7 @@ def test_invalid_images_hold_the_arm(world: World, change: Any, words: str, capf
     assert words in capfd.readouterr().err
 
 
-def test_simulated_time_stamps_the_images_and_holds_the_arm_when_it_is_frozen(
-    make_world: Callable[..., World],
-) -> None:
+def test_simulated_time_stamps_the_images_and_holds_the_arm_when_it_is_frozen(make_world: Callable[..., World]) -> None:
     world = make_world("joint_state", "--ros-args", "-p", "use_sim_time:=true")
     world.simulated = 50.0
     world.start()

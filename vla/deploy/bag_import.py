@@ -27,7 +27,7 @@ from vla.deploy.settings import Topics
 from vla.io.errors import UserError
 from vla.io.images import resize
 from vla.robots.controllers import gripper_index, recorded_controller
-from vla.spec import LONGEST_INSTRUCTION, Array, Episode, Observation, Spec
+from vla.spec import LONGEST_INSTRUCTION, Array, Episode, Spec
 
 STATUS = "/vla_agent/status"  # end of the name of the topic that tells who moves the arm
 GAP = 0.3  # longest time between two commands of one motion [s]
@@ -169,7 +169,8 @@ class _Bag:
 
 
 class BagDemonstrations(imported.ImportedDemonstrations):
-    """Episodes of bags, at the control rate of the task, with the observations that the policy node makes of them.
+    """Episodes of bags, at the control rate of the task, with the observations that the policy node makes of them
+    (UserError: a bag is missing, damaged or incomplete, lacks topics, or is of another robot).
 
     An episode is a time in which one instruction was followed, by the policy, or by a person to whom the arm was handed
     over, from motion to rest; `recorded.person` in its draws tells which. Without the topic of the node's status a
@@ -182,9 +183,6 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         topics: in the bags.
         robot: names of the joints, and travel of the fingers.
         spec: of the task.
-
-    Raises:
-        UserError: a bag is missing, damaged or incomplete, lacks topics, or is of another robot.
     """
 
     def __init__(self, folder: Path | str | None, topics: Topics, robot: JointLimits, *, spec: Spec) -> None:
@@ -233,17 +231,13 @@ class BagDemonstrations(imported.ImportedDemonstrations):
 
     def episode(self, number: int) -> Episode:
         """Return one episode, with its images; raise a UserError if they are damaged."""
-        spec, (bag, segment, steps) = self.spec, self._episodes[number]
-        words, depth = segment.instruction, {camera: np.zeros(spec.image_size, np.uint16) for camera in spec.depth}
-        images = self._images(bag, steps)
-        observations = [
-            Observation({camera: images[camera, at] for camera, at in step.arrivals.items()}, step.state, words, depth)
-            for step in steps
-        ]
-        actions = np.clip(self._actions[number], spec.low, spec.high).astype(np.float32)
-        recorded = {"episode": number, "person": segment.person, "lacks": ["depth"] if spec.depth else []}
-        facts = (number, "recorded", words, "unverified", frozenset[str](), {"recorded": recorded})
-        return Episode(*facts, observations, actions, actions)
+        bag, segment, steps = self._episodes[number]
+        images, rows = self._images(bag, steps), {"state": np.array([step.state for step in steps])}
+        for camera in self.spec.cameras:
+            rows[f"rgb_{camera}"] = np.array([images[camera, step.arrivals[camera]] for step in steps])
+        recorded = {"episode": number, "person": segment.person, "lacks": ["depth"] if self.spec.depth else []}
+        words = segment.instruction
+        return self.recorded_episode(number, words, "unverified", recorded, rows, self._actions[number])
 
     def _steps(self, bag: _Bag, segment: _Segment) -> list[_Step]:
         """Return the steps of a segment, made as the policy node makes its observations; a UserError without any."""
@@ -280,7 +274,7 @@ class BagDemonstrations(imported.ImportedDemonstrations):
             for topic, stamp, message in messages_of(reader, self._cameras, bag.folder, *span):
                 if (place := (self._cameras[topic], (stamp - start) * 1e-9)) in wanted:
                     with bag_errors(bag.folder):
-                        images[place] = resize(messages.image_from(message), self.spec.image_size, "centre")
+                        images[place] = resize(messages.image_from(message), self.spec.image_size)
         return images
 
     def _action(self, bag: _Bag, segment: _Segment, at: float) -> Array:

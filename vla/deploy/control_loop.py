@@ -120,11 +120,8 @@ class ControlLoop:
             self._wait_to_run("")
 
     def take_back(self, now: float) -> None:
-        """Command the arm again, from its measured pose; the gripper is left as it is until the policy moves it.
-
-        Raises:
-            UserError: the arm moves, is outside its limits, or has no recent joint state; the person keeps it.
-        """
+        """Command the arm again, from its measured pose; the gripper is left as it is until the policy moves it
+        (UserError: the arm moves, is outside its limits, or has no recent joint state; the person keeps it)."""
         measured = self._observer.newest
         if measured is None or now - measured.at > self.safety.joints_age:
             raise UserError(f"the newest joint state is older than {self.safety.joints_age} s")

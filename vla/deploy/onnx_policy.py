@@ -60,15 +60,13 @@ class Program(nn.Module):
 
 
 class OnnxPolicy(Policy):
-    """A policy on the CPU that encodes frames and predicts actions with the ONNX programs of its model.
+    """A policy on the CPU that encodes frames and predicts actions with the ONNX programs of its model (UserError: ONNX
+    is not installed, or the model cannot be exported).
 
     The programs are exported once and kept in `folder`, below a digest of code, options and weights of the model:
     `act.onnx`, `encode.onnx` if the model caches tokens of past frames, and `program.json` with their inputs. They
     differ from the model by at most a thousandth of the range of an action, on an episode of noise, return no
     probabilities, and take one observation at a time.
-
-    Raises:
-        UserError: ONNX is not installed, or the model cannot be exported.
     """
 
     def __init__(self, folder: Text | Path, *, model: Model, spec: Spec) -> None:
@@ -88,11 +86,8 @@ class OnnxPolicy(Policy):
 
 
 def write_programs(policy: Policy, folder: Path) -> None:
-    """Write the programs of a policy, on the CPU and not compiled, and `program.json` into a new folder, atomically.
-
-    Raises:
-        UserError: the output of a program differs from the model's.
-    """
+    """Write the programs of a policy, on the CPU and not compiled, and `program.json` into a new folder, atomically
+    (UserError: the output of a program differs from the model's)."""
     span = torch.tensor(np.subtract(policy.spec.high, policy.spec.low), dtype=torch.float32)
     report: dict[str, Any] = {"model": type(policy.model).__name__, "spec": policy.spec.to_dict()}
     with atomic_path(folder) as draft:

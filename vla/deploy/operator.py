@@ -34,15 +34,13 @@ AGENT, SIMULATOR = "/vla_agent", "/vla_simulator"
 
 
 class Operator:
-    """Calls services of the agent and the simulator.
+    """Calls services of the agent and the simulator (UserError: a node is not there, does not respond, refuses or has
+    exited, in all methods).
 
     Args:
         node: calls them; it is spun here.
         topic: of the instructions.
         processes: those of the nodes, if they belong to the operator.
-
-    Raises:
-        UserError: a node is not there, does not respond, refuses or has exited, in all methods.
     """
 
     def __init__(self, node: Any, topic: str, processes: Sequence[BaseProcess] = ()) -> None:
@@ -115,8 +113,10 @@ class Operator:
         Returns the simulator's description of the episode.
         """
         client = self.node.create_client(ChangeState, f"{AGENT}/change_state")
+        there = client.wait_for_service(SETTLED)
+        self.node.destroy_client(client)
         # The reset moves the arm: an active agent would pull it back.
-        active = client.wait_for_service(SETTLED) and self._change(Transition.TRANSITION_DEACTIVATE)
+        active = there and self._change(Transition.TRANSITION_DEACTIVATE)
         said = str(self.call(Trigger, f"{SIMULATOR}/reset", Trigger.Request()).message) if reset else ""
         if active and not self._change(Transition.TRANSITION_ACTIVATE):
             raise UserError("the agent cannot be activated again, see its log")

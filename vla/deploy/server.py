@@ -22,6 +22,7 @@ from http import HTTPStatus
 from ipaddress import ip_address
 from itertools import count
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -49,7 +50,7 @@ Port = Annotated[int, Ge(0), Le(65535)]  # 0: any free one
 
 @dataclass(kw_only=True)
 class PolicyServer:
-    """The policy behind openpi's protocol.
+    """The policy behind openpi's protocol (UserError: other machines could connect without a key).
 
     Attributes:
         host, port: address to listen at.
@@ -60,9 +61,6 @@ class PolicyServer:
         origins: of web pages that may use the policy, such as http://localhost:3000.
         policy, environment: factories of the policy and of the task's environment.
         output: folder of results, unused.
-
-    Raises:
-        UserError: other machines could connect without a key.
     """
 
     host: Text
@@ -92,11 +90,18 @@ class PolicyServer:
             )
         if keyless := [camera for camera in policy.spec.cameras if camera not in self.keys.images]:
             raise UserError(f"the policy sees {', '.join(keyless)}: add +deploy.keys.images.{keyless[0]}=KEY")
+        stop = Event()
+        before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            asyncio.run(Service(self, policy).serve())
+            with Service(self, policy).in_thread() as url:
+                log.info("serving the policy at %s", url)
+                stop.wait()
         except OSError as error:
             where = f"deploy.host={self.host} deploy.port={self.port}"
             raise UserError(f"cannot listen at {where}: {error.strerror}; deploy.port=0 is any free one") from error
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 class Service:
@@ -106,15 +111,6 @@ class Service:
         self._settings, self._policy = settings, policy
         self._waiting: asyncio.Queue[tuple[int, Observation, asyncio.Future[Array]]] = asyncio.Queue()
         self._lanes = set[int]()  # of the policy, one for each connection
-
-    async def serve(self) -> None:
-        """Serve until SIGINT or SIGTERM."""
-        stop, loop = asyncio.Event(), asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, stop.set)
-        async with self._listening() as url:
-            log.info("serving the policy at %s", url)
-            await stop.wait()
 
     @contextmanager
     def in_thread(self) -> Iterator[str]:

@@ -20,11 +20,7 @@ FOLLOW = "follow_joint_trajectory"  # the command that is an action
 
 @dataclass(frozen=True)
 class Topics:
-    """Names of the topics, before remapping.
-
-    Raises:
-        UserError: a name is not valid in ROS.
-    """
+    """Names of the topics, before remapping (UserError: a name is not valid in ROS)."""
 
     images: dict[str, str]  # camera → topic of sensor_msgs/Image, or of CompressedImage if it ends with /compressed
     joint_states: str  # sensor_msgs/JointState

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vla.data.episodes import EpisodeStore
+from vla.data.episodes import EpisodeStore, observations_of
 from vla.io.errors import UserError
 from vla.io.printable import track
 from vla.spec import Array, Episode, Spec
@@ -46,11 +46,8 @@ class ImportedDemonstrations(ABC):
 
     @classmethod
     def recording(cls, **options: Any) -> Recording:
-        """Describe the recording that `options`, the arguments of the constructor but the spec, name.
-
-        Raises:
-            UserError: it is missing or damaged, or this format is for given tasks only.
-        """
+        """Describe the recording that `options`, the arguments of the constructor but the spec, name (UserError: it is
+        missing or damaged, or this format is for given tasks only)."""
         raise UserError(f"{cls.__name__} does not describe its recordings: choose the task that they are of")
 
     @abstractmethod
@@ -61,12 +58,35 @@ class ImportedDemonstrations(ABC):
     def episode(self, number: int) -> Episode:
         """Return one episode; its number is its seed."""
 
-    def fill(self, store: EpisodeStore, episodes: int) -> int:
-        """Append episodes until the store holds `episodes`; returns the number appended.
+    def recorded_episode(
+        self,
+        number: int,
+        instruction: str,
+        outcome: str,
+        recorded: Mapping[str, Any],
+        rows: Mapping[str, Array],
+        actions: Array,
+        executed: Array | None = None,
+    ) -> Episode:
+        """Make an episode of its rows, by field, without depth, which is 0, and of actions (N, D), to be clipped."""
+        spec = self.spec
+        depth = {f"depth_{camera}": np.zeros((len(actions), *spec.image_size), np.uint16) for camera in spec.depth}
+        clipped = np.clip(actions, spec.low, spec.high).astype(np.float32)
+        return Episode(
+            seed=number,
+            task="recorded",
+            instruction=instruction,
+            outcome=outcome,
+            milestones=frozenset(),
+            draws={"recorded": recorded},
+            observations=observations_of(spec, {**rows, **depth}, instruction),
+            actions=clipped,
+            executed=clipped if executed is None else executed,
+        )
 
-        Raises:
-            UserError: there are too few, the store holds other ones, one is damaged, or the disk is full.
-        """
+    def fill(self, store: EpisodeStore, episodes: int) -> int:
+        """Append episodes until the store holds `episodes`; returns the number appended (UserError: there are too few,
+        the store holds other ones, one is damaged, or the disk is full)."""
         if episodes > len(self):
             raise UserError(f"there are only {len(self)} recorded episodes: set collect.episodes={len(self)}, or fewer")
         if episodes < len(self):

@@ -20,12 +20,12 @@ import pyarrow.parquet as pq
 
 from vla.data.formats import lerobot_layout as layout
 from vla.data.formats import lerobot_tables as tables
-from vla.data.formats.lerobot_images import decode, decode_file, require_video
+from vla.data.formats.lerobot_images import decode, require_video
 from vla.data.formats.lerobot_tables import COUNTS, MEND, NUMBERS, PICTURES, REMEDY, TIMES
 from vla.data.index import listed
 from vla.io.documents import read_bounded, read_json
 from vla.io.errors import UserError
-from vla.io.images import resize
+from vla.io.images import decode_image, resize
 from vla.spec import LONGEST_INSTRUCTION, Array
 
 IMAGES = ("video", "image")
@@ -51,7 +51,8 @@ class Part:
 
 
 class LeRobotDataset:
-    """Metadata, instructions and episodes of a dataset, version 3.0.
+    """Metadata, instructions and episodes of a dataset, version 3.0 (UserError: the dataset is missing, incomplete,
+    damaged, of another version, contradicts itself, names images that it does not have, or has several rates).
 
     Attributes:
         folder: of the dataset.
@@ -62,10 +63,6 @@ class LeRobotDataset:
     Args:
         folder: of the dataset.
         images: camera → key; None: every feature of images, named without `observation.images.`.
-
-    Raises:
-        UserError: the dataset is missing, incomplete, damaged, of another version, contradicts itself, names images
-            that it does not have, or has several rates.
     """
 
     def __init__(self, folder: Path, images: Mapping[str, str] | None) -> None:
@@ -80,12 +77,10 @@ class LeRobotDataset:
         self.parts = self._read_parts([key for key in self.images.values() if self._is_video(key)])
 
     def components(self, keys: Sequence[str], anonymous: Sequence[str] = ()) -> dict[str, tuple[str, int]]:
-        """Return component → its feature and index, of several features in order.
+        """Return component → its feature and index, of several features in order (UserError: there is no such feature,
+        or it is no vector of a reasonable size).
 
         Unnamed components are called by `anonymous` if there are as many, else by their feature and index.
-
-        Raises:
-            UserError: there is no such feature, or it is no vector of a reasonable size.
         """
         features = self.info.features
         vectors = [key for key, feature in features.items() if len(feature.shape) == 1]
@@ -124,11 +119,8 @@ class LeRobotDataset:
         return found
 
     def require_images(self, cameras: Sequence[str]) -> None:
-        """Require the images of cameras; decodes the first one of each camera alone.
-
-        Raises:
-            UserError: a file is missing or damaged, or contradicts others.
-        """
+        """Require the images of cameras; decodes the first one of each camera alone (UserError: a file is missing or
+        damaged, or contradicts others)."""
         images = [self.images[camera] for camera in cameras]
         self._require_videos([key for key in images if self._is_video(key)])
         for path in tables.files(self.folder / "data"):
@@ -139,7 +131,7 @@ class LeRobotDataset:
     def frames(self, part: Part, camera: str, size: tuple[int, int], every: int) -> Array:
         """Return every `every`-th image of a part, (N, H, W, 3) uint8, cropped at the centre and resized to `size`."""
         images = self._decoded(part, self.images[camera], every)
-        return np.stack([resize(image, size, "centre") for image in images])
+        return np.stack([resize(image, size) for image in images])
 
     def _read_parts(self, videos: Sequence[str]) -> list[Part]:
         """Return the parts of all episodes, in order, with the places of the `videos`, keys of features."""
@@ -209,7 +201,7 @@ class LeRobotDataset:
         column = tables.read(part.files, {key: PICTURES}, [(OWNER, "=", part.episode)])[key][part.steps]
         for step in range(0, len(part), every):
             try:
-                yield decode_file(self._content(column[step].as_py() or {}), size)
+                yield decode_image(self._content(column[step].as_py() or {}), size)
             except UserError as error:
                 step += part.steps.start
                 raise UserError(f"{self.folder}: {key} of episode {part.episode}, step {step}: {error}") from error

@@ -13,12 +13,11 @@ from typing import Annotated
 import numpy as np
 from annotated_types import MinLen, Predicate
 
-from vla.data.episodes import EpisodeStore, observations_of
+from vla.data.episodes import EpisodeStore
 from vla.data.formats import imported_demonstrations as imported
 from vla.data.formats import lerobot_layout as layout
 from vla.data.formats.lerobot_dataset import LeRobotDataset
 from vla.io.errors import UserError
-from vla.io.images import describe_resize
 from vla.io.types import Count, Text, unique
 from vla.spec import Array, Episode, Spec
 
@@ -34,7 +33,8 @@ log = logging.getLogger(__name__)
 
 
 class LeRobotDemonstrations(imported.ImportedDemonstrations):
-    """Episodes of a LeRobot dataset, version 3.0, that has the cameras, state, action and rate of the task.
+    """Episodes of a LeRobot dataset, version 3.0, that has the cameras, state, action and rate of the task (UserError:
+    the dataset is missing or damaged, or differs from the task; the message lists all differences).
 
     Images are videos, or PNG, JPEG or WebP in tables or files; those of another size are cropped at the centre
     to the aspect ratio of the task, and resized. Actions beyond the bounds of the task are clipped. Every episode is a
@@ -49,9 +49,6 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         state, action: keys of the features that hold the components, which are found by name.
         every: keep every n-th frame with the last of n actions, which suits absolute actions only.
         spec: of the task.
-
-    Raises:
-        UserError: the dataset is missing or damaged, or differs from the task; the message lists all differences.
     """
 
     def __init__(
@@ -72,10 +69,10 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         rates = [key for key in (layout.RATES,) if key in features and features[key].components]
         for name, place in dataset.components(rates).items():
             self._state.setdefault(name, place)
-        executed = [layout.EXECUTED] if features.get(layout.EXECUTED) == features.get(layout.ACTION) else []
+        same = layout.EXECUTED in features and features[layout.EXECUTED].components == [*spec.action]
+        executed = [layout.EXECUTED] if same else []
         self._lacks = [*(["depth"] if spec.depth else []), *([] if executed else [layout.EXECUTED])]
         self._lacks += [] if all(name in self._state for name in spec.state) else [layout.RATES]
-        self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
         differences = [*self._mismatches()]
         if all(name in self._action for name in spec.action):
             read = [*state, *action, *rates, *executed]
@@ -115,29 +112,20 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         spec, dataset, part = self.spec, self._dataset, self._dataset.parts[number]
         first = np.arange(part.steps.start, part.steps.stop, self._every)
         last = np.minimum(first + self._every - 1, part.steps.stop - 1)  # the target at the end of the period
-        actions = np.clip(self._actions[part.rows[last]], self._low, self._high)
         images = {
             f"rgb_{camera}": dataset.frames(part, camera, spec.image_size, self._every) for camera in spec.cameras
         }
-        images |= {f"depth_{camera}": np.zeros((len(first), *spec.image_size), np.uint16) for camera in spec.depth}
-        return Episode(
-            seed=number,
-            task="recorded",
-            instruction=part.instruction,
-            outcome="success",
-            milestones=frozenset(),
-            draws={"recorded": {"episode": part.episode, "first_step": part.steps.start, "lacks": self._lacks}},
-            observations=observations_of(spec, {**images, "state": self._states(part.rows)[first]}, part.instruction),
-            actions=actions,
-            executed=actions if layout.EXECUTED in self._lacks else self._numbers[layout.EXECUTED][part.rows[last]],
-        )
+        recorded = {"episode": part.episode, "first_step": part.steps.start, "lacks": self._lacks}
+        executed = None if layout.EXECUTED in self._lacks else self._numbers[layout.EXECUTED][part.rows[last]]
+        rows, actions = {**images, "state": self._states(part.rows)[first]}, self._actions[part.rows[last]]
+        return self.recorded_episode(number, part.instruction, "success", recorded, rows, actions, executed)
 
     def fill(self, store: EpisodeStore, episodes: int) -> int:
         """Append episodes, and log what an import changes: images, episodes of several tasks, actions beyond bounds."""
         for camera in self.spec.cameras:
             shape = self._dataset.info.features[self._dataset.images[camera]].image_size
-            if resizing := describe_resize(shape, self.spec.image_size, "centre"):
-                log.info("camera %s: %s", camera, resizing)
+            if shape != tuple(self.spec.image_size):
+                log.info("images of %s are cropped at the centre and resized to task.image_size", camera)
         whole = len({part.episode for part in self._dataset.parts})
         if whole < len(self):
             log.info("%d episodes become %d, one per instruction: the task changes within some", whole, len(self))

@@ -68,11 +68,8 @@ def files(folder: Path) -> list[Path]:
 
 
 def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -> pa.Table:
-    """Read the named columns of Parquet files, concatenated; `only` filters rows.
-
-    Raises:
-        UserError: a file is damaged, is too large, or lacks a column of the expected type.
-    """
+    """Read the named columns of Parquet files, concatenated; `only` filters rows (UserError: a file is damaged, is too
+    large, or lacks a column of the expected type)."""
     tables = list[pa.Table]()
     for path in paths:
         require(path, columns)
