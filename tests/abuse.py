@@ -81,7 +81,7 @@ WRONG = (
     ),
     *(
         "job=deploy deploy=ros2 checkpoint=CKPT deploy.topics.commands=bad!topic",
-        "job=export export=program export.folder=x",
+        "job=export export=program",
     ),
     *(
         "job=deploy deploy=ros2 checkpoint=CKPT deploy.network.domain=9999",
@@ -175,7 +175,6 @@ def checkpoints(root: Path) -> Trials:
         "evaluate": (named, *EVALUATE, "output=wrong"),
         "resume": ("resume=evil", "output=evil", "job=train"),
         "pretrained": (f"pretrained={evil}", *TRAIN, "collect.folder=store", "output=wrong"),
-        "program": (named, "job=export", "export=program", "export.folder=program", "output=wrong"),
         "deploy": (named, "job=deploy", "deploy=ros2", "output=wrong"),
     }
     own = torch.load(root / CHECKPOINT / "checkpoints/last.ckpt", weights_only=True)["config"]
@@ -202,7 +201,7 @@ def disks(root: Path) -> Trials:
         *("job=preview preview.episodes=1", "job=collect collect.episodes=12"),
         *(
             "job=export export=lerobot export.folder=full",
-            "job=export export=program checkpoint=CKPT export.folder=full",
+            "checkpoint=CKPT policy=onnx policy.folder=full evaluate.episodes=1 cluster.workers=1",
         ),
         *(
             "job=collect collect.episodes=12 collect.images=jpeg",

@@ -44,14 +44,7 @@ DEFINITIONS = {
         ),
     },
 }
-USED = (
-    "action_msgs",
-    "builtin_interfaces",
-    "service_msgs",
-    "std_msgs",
-    "trajectory_msgs",
-    "unique_identifier_msgs",
-)
+USED = ("action_msgs", "builtin_interfaces", "service_msgs", "std_msgs", "trajectory_msgs", "unique_identifier_msgs")
 PREFIX = Path(sys.prefix)
 
 

@@ -29,15 +29,9 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bags.write(tmp_path_factory.mktemp("bags") / "bag")
 
 
-def imported(folder: Path, steps: Any = "corrected", spec: Any = SPEC, **changed: Any) -> BagDemonstrations:
-    options: dict[str, Any] = {
-        "topics": TOPICS,
-        "status": "/vla_agent/status",
-        "robot": ROBOT,
-        "image_crop": "centre",
-        **changed,
-    }
-    return BagDemonstrations(folder, steps, **options, spec=spec)
+def imported(folder: Path, spec: Any = SPEC, **changed: Any) -> BagDemonstrations:
+    options: dict[str, Any] = {"topics": TOPICS, "robot": ROBOT, **changed}
+    return BagDemonstrations(folder, **options, spec=spec)
 
 
 def brightness(episode: Episode) -> list[int]:
@@ -45,52 +39,34 @@ def brightness(episode: Episode) -> list[int]:
     return [int(seen.rgb["front"].mean()) // 3 for seen in episode.observations]
 
 
-def test_what_a_person_did_is_an_episode_from_the_first_motion_to_the_last(bag: Path) -> None:
+def test_an_episode_is_what_was_done_for_an_instruction_by_the_policy_or_a_person(bag: Path) -> None:
     demonstrations = imported(bag)
-    assert len(demonstrations) == 1
-    episode = demonstrations.episode(0)
-    assert episode.instruction == "put the red block on the pad" and episode.outcome == "unverified"
-    numbers = brightness(episode)
-    assert numbers == list(range(numbers[0], numbers[-1] + 1))
-    assert 32 <= numbers[0] <= 33 and 44 <= numbers[-1] <= 46  # of the 33 … 44 in which the person moved the arm
-    assert episode.draws["expert_acts"] == [(0, len(numbers) - 1)] and episode.draws["recorded"]["corrected"] == 1.0
-    first = numbers.index(33)
-    np.testing.assert_allclose(episode.actions[first : first + 12], bags.executed((4,)), atol=2e-4)
-    assert episode.actions.dtype == np.float32 and (episode.actions[first:, 6] == 0).all()
-
-
-def test_everything_is_an_episode_per_try_and_says_who_acted(bag: Path) -> None:
-    demonstrations = imported(bag, "all")
     episodes = [demonstrations.episode(number) for number in range(len(demonstrations))]
     words = ["put the red block on the pad"] * 3 + ["lift the blue block"]
     assert [episode.instruction for episode in episodes] == words
-    assert episodes[0].draws["expert_acts"] == []
-    assert [round(episode.draws["recorded"]["corrected"]) for episode in episodes] == [0, 1, 0, 0]
+    assert [episode.draws["recorded"]["person"] for episode in episodes] == [False, True, False, False]
+    assert {episode.outcome for episode in episodes} == {"unverified"}
     np.testing.assert_allclose(episodes[0].actions[:18], bags.executed((1,))[:18], atol=2e-4)
     state = episodes[0].observations[0].state
     assert state[14] == pytest.approx(0.08) and np.abs(state[:7] - bags.HOME).max() < 0.05
     assert [seen.instruction for seen in episodes[3].observations] == ["lift the blue block"] * 6
-
-
-def test_a_policy_that_runs_on_from_the_hand_of_a_person_is_one_episode(tmp_path: Path) -> None:
-    parts = (
-        bags.Part("running", bags.moving(10, 0), instruction="lift it"),
-        bags.Part("handed over", bags.moving(10, 1), person=True),
-        bags.Part("running", bags.moving(10, 2)),
-    )
-    (episode,) = [*map(imported(bags.write(tmp_path / "bag", parts), "all").episode, range(1))]
-    ((first, last),) = episode.draws["expert_acts"]
-    assert len(episode.actions) == 29 and 9 <= first <= 10 and 18 <= last <= 19
+    person = episodes[1]  # from the first motion to the last
+    numbers = brightness(person)
+    assert numbers == list(range(numbers[0], numbers[-1] + 1))
+    assert 32 <= numbers[0] <= 33 and 44 <= numbers[-1] <= 46  # of the 33 … 44 in which the person moved the arm
+    first = numbers.index(33)
+    np.testing.assert_allclose(person.actions[first : first + 12], bags.executed((4,)), atol=2e-4)
+    assert person.actions.dtype == np.float32 and (person.actions[first:, 6] == 0).all()
 
 
 def test_an_arm_that_is_guided_by_hand_moves_as_measured(tmp_path: Path) -> None:
     parts = (
-        bags.Part("running", bags.moving(5, 0), instruction="lift it"),
+        bags.Part("running", bags.moving(6, 0), instruction="lift it"),
         bags.Part("handed over", bags.moving(10, 1, gripper=0.0), person=True, commands=False),
         bags.Part("holding", np.repeat(bags.RESTING, 3, 0)),
     )
-    episode = imported(bags.write(tmp_path / "bag", parts)).episode(0)
-    first = brightness(episode).index(6)
+    episode = imported(bags.write(tmp_path / "bag", parts)).episode(1)
+    first = brightness(episode).index(7)
     np.testing.assert_allclose(episode.actions[first : first + 8, :6], bags.moving(8, 1)[:, :6], atol=2e-4)
     assert (episode.actions[first : first + 8, 6] == 0).all()  # as measured, not as the policy last commanded
 
@@ -117,13 +93,13 @@ def test_joint_positions_of_any_robot_are_learned_from_a_bag_alone(bag: Path) ->
     spec = build(config["task"], "task").spec
     assert (spec.control_hz, spec.cameras, spec.action) == (10.0, ("front", "wrist"), tuple(ROBOT.joints))
     demonstrations = build(config["expert"], "expert", spec=spec)
-    assert len(demonstrations) == config["collect"]["episodes"] == 1
-    episode = demonstrations.episode(0)
+    assert len(demonstrations) == config["collect"]["episodes"] == 4
+    episode = demonstrations.episode(1)
     states = [seen.state for seen in episode.observations]
     np.testing.assert_allclose(episode.actions[:-1], states[1:], atol=0.01)
     assert np.abs(np.diff(episode.actions, axis=0)).sum() > 0.05
     degrees = replace(spec, units=("deg",) * len(spec.action))
-    with pytest.raises(ValueError, match=r"most actions exceed the bounds of .*: set task\.low and task\.high"):
+    with pytest.raises(ValueError, match=r"does not match the task: .* \(other units, or absolute\?\)"):
         build(config["expert"], "expert", spec=degrees)
 
 
@@ -131,9 +107,11 @@ def test_joint_positions_of_any_robot_are_learned_from_a_bag_alone(bag: Path) ->
     ("changed", "says"),
     [
         ({"topics": replace(TOPICS, images={"front": "/top", "wrist": "/wrist"})}, "has no topic /top, it has"),
-        ({"topics": replace(TOPICS, joint_states="/front")}, "/front is of type sensor_msgs/msg/Image, expect"),
+        (
+            {"topics": replace(TOPICS, images={"front": "/commands"}), "spec": replace(SPEC, cameras=("front",))},
+            "/commands can be used: they are of type sensor_msgs/msg/JointState",
+        ),
         ({"robot": replace(ROBOT, joints=[f"fr3_joint{n}" for n in range(1, 8)])}, "lacks fr3_joint1, .* has"),
-        ({"status": "/status"}, "no topic /status, .* choose it with expert.status=/vla_agent/status"),
         ({"spec": replace(SPEC, robot=None)}, "expert=bag needs a robot"),
         ({"spec": replace(SPEC, cameras=("top",))}, r"no topic for the cameras top: add \+expert\.topics"),
     ],
@@ -158,11 +136,11 @@ def test_images_of_another_kind_are_refused(tmp_path: Path, monkeypatch: pytest.
         imported(bags.write(tmp_path / "bag"))
 
 
-def test_without_a_correction_there_is_nothing_to_import_but_what_the_policy_did(tmp_path: Path) -> None:
-    bag = bags.write(tmp_path / "bag", bags.SESSION[-2:])
-    with pytest.raises(ValueError, match=r"has no corrections: .* expert\.steps=all"):
-        imported(bag)
-    assert len(imported(bag, "all")) == 1
+def test_the_bags_in_a_folder_are_imported_in_order(tmp_path: Path) -> None:
+    for name, words in (("first", "lift it"), ("second", "put it down")):
+        bags.write(tmp_path / name, [bags.Part("running", bags.moving(10, 0), instruction=words)])
+    demonstrations = imported(tmp_path)
+    assert [demonstrations.episode(number).instruction for number in (0, 1)] == ["lift it", "put it down"]
 
 
 @pytest.mark.parametrize("name", ["bag.mcap", "metadata.yaml"])
@@ -183,7 +161,7 @@ def test_a_damaged_bag_is_imported_or_refused_in_a_sentence(tmp_path: Path, name
             changed[place] ^= 1 << generator.randrange(8)
         (whole / name).write_bytes(changed)
         try:
-            demonstrations = imported(whole, "all")
+            demonstrations = imported(whole)
             for number in range(len(demonstrations)):
                 assert np.isfinite(demonstrations.episode(number).actions).all()
         except ValueError as error:

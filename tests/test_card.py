@@ -20,12 +20,7 @@ from vla.data.verification import verify_store
 from vla.reports.dataset_card import store_table, write_card
 
 DRAWS: list[dict[str, Any]] = [
-    {
-        "light": {"tint": [0.1 * seed, 0.2, 0.3], "on": seed > 1},
-        "names": ["red", f"$|[{seed}]"],
-        "far": 0.5,
-        "n": seed,
-    }
+    {"light": {"tint": [0.1 * seed, 0.2, 0.3], "on": seed > 1}, "names": ["red", f"$|[{seed}]"], "far": 0.5, "n": seed}
     | {"pad": [0.1 * seed, -0.2], "blocks": [[0.1, 0.2], [0.3, 0.1 * seed]], "four": [1.0, 2.0, 3.0, float(seed)]}
     | ({"nothing": None, "some": [0.5] * seed} if seed < 2 else {"nested": [[0.1, 0.2, 0.3], [0.4, 0.5, 0.1 * seed]]})
     for seed in range(5)

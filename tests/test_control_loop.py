@@ -374,7 +374,8 @@ def test_the_tool_stays_in_the_workspace_where_joints_at_their_limits_bend_its_p
     low, high = np.array([0.25, -0.4, 0.008]), np.array([0.75, 0.4, 0.5])
     world = World(replace(SAFETY, workspace=(tuple(low), tuple(high))))
     if fast:
-        world.loop.limit(replace(ROBOT, acceleration=[100.0] * 7, speed_share=1.0, acceleration_share=1.0))
+        faster = replace(ROBOT, acceleration=[100.0] * 7)
+        world.loop = ControlLoop(SPEC, faster, world.loop.safety, 50.0)
     random = np.random.default_rng(0)
     world.run(0.1)
     world.loop.on_instruction("go", world.now)
@@ -428,7 +429,7 @@ def test_a_plan_for_the_instruction_before_is_not_executed(world: World) -> None
 
 def test_what_was_grasped_is_held_to_the_end_of_what_was_sent_ahead() -> None:
     world = World()
-    world.loop.limit(replace(ROBOT, acceleration=[3.0] * 7))
+    world.loop = ControlLoop(SPEC, replace(ROBOT, acceleration=[3.0] * 7), SAFETY, 50.0)
     world.run(0.1)
     world.loop.on_instruction("go", world.now)
     grasp = np.repeat(FORWARD, 4, 0)

@@ -14,7 +14,6 @@ import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,10 +22,8 @@ import numpy as np
 import pytest
 import rclpy
 import yaml
-from arm import ROBOT
 from command_line import SMALL, here, vla
 from composing import composed
-from defaults import defaults_of
 from documented import TEXT
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -36,13 +33,11 @@ from warm import Started
 
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
-from vla.deploy import messages
-from vla.deploy.demo_operator import DemoOperator
 from vla.deploy.loop import Loop
 from vla.deploy.messages import SimulatedEpisode
+from vla.deploy.operator import DemoOperator
 from vla.deploy.ros import NETWORKS, RosNetwork, split_arguments
 from vla.io.errors import UserError
-from vla.io.images import resize
 from vla.jobs import deploy as job
 from vla.models.policy_folder import read_policy
 from vla.robots.panda import forward
@@ -143,7 +138,7 @@ def test_an_instruction_moves_the_arm_and_a_signal_leaves_it_at_rest(
     """The other signal ends the agent whose simulator was killed, below."""
     number = signal.SIGTERM
     simulator = start("vla.run", "job=deploy", "deploy=simulator", CHECKPOINT)
-    agent = start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT, "--ros-args", "-p", "speed_share:=0.3")
+    agent = start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT, "deploy.robot.speed_share=0.3")
     record = start("vla.deploy.record", "bag")
     probe.until(lambda: probe.states and probe.commands)
     probe.until(lambda: probe.discovered() >= documented_names())  # names arrive after the first messages
@@ -199,26 +194,6 @@ def test_the_shell_stops_and_resumes_the_agent_and_when_that_is_killed_the_simul
 
 
 @pytest.mark.realtime
-def test_when_the_simulator_is_killed_the_agent_holds_the_arm_and_logs_the_reason(
-    start: Callable[..., Started], probe: Probe
-) -> None:
-    simulator = start("vla.run", "job=deploy", "deploy=simulator", CHECKPOINT)
-    agent = start("vla.run", "job=deploy", "deploy=ros2", CHECKPOINT)
-    probe.until(lambda: probe.commands)
-    probe.say("put the red block on the pad")
-    probe.until(lambda: probe.moved() > 1e-3)
-    simulator.kill()
-    probe.spin(1.0)
-    probe.commands.clear()
-    probe.spin(0.3)
-    assert probe.commands and not np.ptp([command.position[:7] for command in probe.commands], axis=0).any()
-    agent.send_signal(signal.SIGINT)
-    printed = agent.printed(10)
-    assert agent.wait() == 0, printed
-    assert re.search(r"holding: the newest (image of the camera \w+|joint state) is older than", printed), printed
-
-
-@pytest.mark.realtime
 def test_the_whole_loop_reports_and_its_bag_is_learned_from(home: Path, start: Callable[..., Started]) -> None:
     limit = "task.time_limit=1.5"
     loop = start("vla.run", "job=deploy", "deploy=loop", CHECKPOINT, limit, "deploy.episodes=2", "output=loop")
@@ -239,7 +214,7 @@ def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monk
         raise UserError("timed out after 60 s")
 
     results = [Result(5, "success")]
-    operator = SimpleNamespace(play=play, stopped=threading.Event(), status={})
+    operator = SimpleNamespace(play=play, stopped=threading.Event(), values={})
     monkeypatch.setattr(Loop, "running", lambda loop: nullcontext(operator))
     agent = ("agent=remote", "agent.url=ws://127.0.0.1:1")
     experiment = Experiment.of(composed("job=deploy", "deploy=loop", *agent, f"output={tmp_path}"))
@@ -252,9 +227,7 @@ def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monk
 def learn_from_the_bag(home: Path) -> None:
     """The other two commands of docs/ros2.md, after the one that recorded."""
     bag = ("expert=bag", "expert.folder=loop/bag", "collect.folder=lessons")
-    nobody = here(home, "job=collect", CHECKPOINT, *bag, ok=False)
-    assert "error: loop/bag has no corrections" in nobody.stderr
-    here(home, "job=collect", CHECKPOINT, *bag, "expert.steps=all")
+    here(home, "job=collect", CHECKPOINT, *bag)
     store = EpisodeStore(home / "lessons")
     policy = read_policy(home / "run")
     store.spec.require(policy.spec.without_truth, "the bag", "the policy")
@@ -262,7 +235,7 @@ def learn_from_the_bag(home: Path) -> None:
     for entry in store.episodes:
         assert 8 <= entry.steps <= 20 and "block" in entry.instruction
         rows = store.read(entry)
-        assert rows["rgb_front"].std() > 5 and entry.draws["expert_acts"] == []
+        assert rows["rgb_front"].std() > 5 and not entry.draws["recorded"]["person"]
         tools = [forward(joints)[0][:3, 3] for joints in rows["state"][:, :7]]
         moved = rows["action"][:6, :3].sum(0)  # within reach of the arm, that of an untrained policy
         np.testing.assert_allclose(moved, tools[6] - tools[0], atol=0.04)
@@ -270,37 +243,6 @@ def learn_from_the_bag(home: Path) -> None:
     lessons = (*SMALL, "collect.more=[lessons]", "output=wiser")
     here(home, "job=train", CHECKPOINT.replace("checkpoint", "pretrained", 1), *lessons)
     assert (home / "wiser/checkpoints/last.ckpt").is_file()
-
-
-def test_the_node_acts_like_the_evaluated_policy(home: Path) -> None:
-    """On the same observations, through messages and back, bit for bit."""
-    from vla.config import experiment as parts
-    from vla.spec import Observation
-
-    checkpoint = home / "run/policy"
-    environment = parts.make_environment(read_policy(checkpoint).config["task"])
-    node = {"_target_": "vla.policy.Policy", **defaults_of("policy/default")}
-    evaluated, deployed = (parts.make_policy(node, checkpoint, environment) for _ in range(2))
-    assert environment.spec.robot is not None
-    names = list(environment.spec.robot.joints)
-    robot = replace(ROBOT, joints=names)
-    observation = environment.reset(5)
-    for _ in range(6):
-        action = evaluated.act(observation)
-        images = {
-            camera: messages.fill_image(SimpleNamespace(header=SimpleNamespace()), image, camera)
-            for camera, image in observation.rgb.items()
-        }
-        fingers = [float(observation.state[14]) / 2] * 2
-        state = JointState(name=[*names, "left", "right"], position=[*observation.state[:7].tolist(), *fingers])
-        state.velocity = [*observation.state[7:14].tolist(), 0.0, 0.0]
-        joints, velocities, gripper = messages.JointStates(robot).read(state, 0.0) or pytest.fail("it has the arm")
-        size = environment.spec.image_size
-        rgb = {camera: resize(messages.image_from(message), size, "centre") for camera, message in images.items()}
-        seen = Observation(rgb, np.array([*joints, *velocities, gripper], np.float32), observation.instruction)
-        np.testing.assert_array_equal(deployed.plan(seen)[0], action)
-        observation = environment.step(action)
-    environment.close()
 
 
 def test_arguments_of_ros_are_split_off() -> None:
@@ -316,12 +258,8 @@ def test_arguments_of_ros_are_split_off() -> None:
         ([CHECKPOINT, "deploy=ros2", "deploy.network.profile=nowhere.xml"], "nowhere.xml"),
         ([CHECKPOINT, "deploy=ros2", "deploy.topics.commands='bad topic!'"], "topics.commands is 'bad topic!'"),
         ([CHECKPOINT, "deploy=ros2", "--ros-args", "--nonsense"], "--nonsense"),
-        ([CHECKPOINT, "deploy=ros2", "--ros-args", "-p", "speed_share:=2.0"], "speed_share out of range"),
         ([CHECKPOINT, "deploy=loop", "deploy.agent.command=trajectory"], "obeys deploy.agent.command=joint_state only"),
-        (
-            [CHECKPOINT, "deploy=simulator", "deploy.joints_hz=25"],
-            "joints_hz=25 must be a multiple of the task's 10",
-        ),
+        ([CHECKPOINT, "deploy=simulator", "deploy.joints_hz=25"], "joints_hz=25 must be a multiple of the task's 10"),
         ([CHECKPOINT, "deploy=ros2", "~deploy.topics.images.wrist"], "wrist"),
     ],
 )

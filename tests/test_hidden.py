@@ -44,7 +44,6 @@ def test_nothing_that_is_hidden_acts(attack: str, tmp_path: Path, monkeypatch: p
         ways: dict[str, Callable[[], Any]] = {
             "policy": lambda: make_policy(plain(composed().policy), path),  # as programs do
             "evaluate": adopted(),
-            "export": adopted("job=export", "export=program", "export.folder=new"),
             "deploy": adopted("job=deploy", "deploy=ros2"),
             "pretrained": lambda: run_job(finetune(composed(*small, f"pretrained={path}", "job=train"), [])),
             "improve": lambda: run_job(finetune(composed(*small, f"pretrained={path}", "job=improve"), [])),

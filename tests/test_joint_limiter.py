@@ -78,18 +78,6 @@ def test_braking_ends_at_rest_within_what_the_acceleration_allows(limiter: Joint
     assert limiter.resting
 
 
-def test_a_speed_limit_that_is_lowered_on_the_way_is_reached_by_braking(limiter: JointLimiter) -> None:
-    for _ in range(50):
-        limiter.step(np.array([0.9, 1.9]))
-    fast = limiter.velocity
-    limiter.limits = replace(ROBOT, speed_share=0.1)
-    steps = [fast, *(limiter.velocity for _ in range(30) if limiter.step(np.array([0.9, 1.9])) is not None)]
-    assert (np.abs(np.diff(steps, axis=0)) <= ROBOT.max_acceleration * PERIOD + 1e-9).all()
-    assert (np.abs(fast) > limiter.limits.max_speed).any() and (
-        np.abs(steps[-1]) <= limiter.limits.max_speed + 1e-9
-    ).all()
-
-
 def test_an_arm_outside_its_limits_is_not_taken_over() -> None:
     with pytest.raises(ValueError, match=r"b is at 1\.990 rad, outside -1\.950 to 1\.950"):
         JointLimiter(ROBOT, PERIOD).start(np.array([0.0, 1.99]))

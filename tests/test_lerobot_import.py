@@ -61,21 +61,19 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
-def test_what_was_exported_comes_back(home: Path, tmp_path: Path) -> None:
+def test_what_was_exported_comes_back(home: Path) -> None:
     before = EpisodeStore(home / "store")
-    deep = imported(exporter("lerobot", tmp_path / "deep", "export.depth=true").export(before), tmp_path / "store")
-    for after, lacks in ((EpisodeStore(home / "imported"), ["depth"]), (deep, [])):
-        assert after.spec == ARM_SPEC.without_truth and "truth" not in after.fields
-        for there, here in zip(before.episodes, after.episodes, strict=True):
-            expected, found = before.read(there), after.read(here)
-            assert here.instruction == there.instruction
-            assert here.draws == {"recorded": {"episode": here.seed, "lacks": lacks, "first_step": 0}}
-            for name in ("state", "action", "executed"):
-                np.testing.assert_array_equal(found[name], expected[name])
-            for camera in ARM_SPEC.cameras:
-                assert np.abs(found[f"rgb_{camera}"].astype(float) - expected[f"rgb_{camera}"]).mean() < 10
-                depth = np.zeros_like(expected[f"depth_{camera}"]) if lacks else expected[f"depth_{camera}"]
-                np.testing.assert_array_equal(found[f"depth_{camera}"], depth)
+    after = EpisodeStore(home / "imported")
+    assert after.spec == ARM_SPEC.without_truth and "truth" not in after.fields
+    for there, here in zip(before.episodes, after.episodes, strict=True):
+        expected, found = before.read(there), after.read(here)
+        assert here.instruction == there.instruction
+        assert here.draws == {"recorded": {"episode": here.seed, "lacks": ["depth"], "first_step": 0}}
+        for name in ("state", "action", "executed"):
+            np.testing.assert_array_equal(found[name], expected[name])
+        for camera in ARM_SPEC.cameras:
+            assert np.abs(found[f"rgb_{camera}"].astype(float) - expected[f"rgb_{camera}"]).mean() < 10
+            assert not found[f"depth_{camera}"].any()
 
 
 def test_an_import_goes_on_where_it_was(home: Path, tmp_path: Path) -> None:
@@ -390,28 +388,18 @@ MP4 = f"{VIDEO}chunk-000/file-000.mp4"
 # What is wrong with a dataset, and what is said of it; where a copy would not help, none is advised.
 REFUSED: list[tuple[Change, str]] = [
     (lambda dataset: shutil.rmtree(dataset), r"no LeRobot dataset in .*dataset \(no meta/info\.json\)"),
-    (told(codebase_version="v2.1"), r"info\.json has version v2\.1: convert the dataset to v3\.0 with lerobot"),
-    (told(codebase_version="v3.1"), r"has version v3\.1, newer than v3\.0, which is read here: look for a newer vla"),
-    (told(codebase_version=None), r"has no version, but None: write or convert the dataset to v3\.0"),
-    (told(codebase_version=["v3.0"] * 1000), r"has no version, but \['v3\.0', .{1,12}: write or convert"),
+    (told(codebase_version="v2.1"), r"info\.json has version v2\.1, and v3\.0 is read here: convert an older dataset"),
+    (told(codebase_version=["v3.0"] * 1000), r"has version \['v3\.0', .{1,12}, and v3\.0 is read here"),
     (info(lambda info: info.pop("features")), r"info\.json is damaged or of another kind: features: Field required"),
     (told(fps=0), r"fps: Input should be greater than 0"),
-    (told(features=feature("action", "x")), r"features\.action\.shape: Input should be"),
     (told(features=feature("action", [3], [5])), r"no vector observation\.state, it has act"),
-    (told(features=feature("a" * 10_000, [3])), r"no vector observation\.state, it has a{500}$"),
     (info(lambda info: info["features"]["action"].update(shape=[10**9])), "1000000000 components in action, the limit"),
     (info(drop), r"it has none at all; action of 6 numbers \(action_0, .*, the task has 3 \(x, y, grip"),
     (lambda dataset: (dataset / INFO).write_text('{"features": ' + "[" * 100_000), r"json is damaged or of .*: copy"),
     (lambda dataset: (dataset / INFO).write_text('{"codebase_version": '), r"copy the dataset again"),
-    (
-        without_second,
-        r"lists 2 of the 3 episodes that meta/info\.json counts: copy the dataset again .* or correct",
-    ),
+    (without_second, r"lists 2 of the 3 episodes that meta/info\.json counts: copy the dataset again .* or correct"),
     (told(total_frames=1000), r"lists \d+ of the 1000 frames that meta/info\.json counts: copy"),
-    (
-        rows(lambda table: table.slice(0, len(table) - 1)),
-        r"holds 10 of the 11 steps .* of episode 2: copy",
-    ),
+    (rows(lambda table: table.slice(0, len(table) - 1)), r"holds 10 of the 11 steps .* of episode 2: copy"),
     (
         rows(lambda table: pa.concat_tables([table, table.slice(0, 1)])),
         r"holds 13 of the 12 steps that meta/episodes counts of episode 0: correct",
@@ -425,19 +413,15 @@ REFUSED: list[tuple[Change, str]] = [
     (film(80, 16, 20), r"mp4 has 20 images per second, the dataset 10: encode the video again"),
     (column(TASKS, "task", None), "none of them task with texts: correct"),
     (column(TASKS, "task", "a" * 1001), "tasks of more than 1000 characters: 0"),
-    (column(TASKS, "task_index", "0"), "task_index does not hold integers"),
     (column(ROWS, "task_index", 7), r"tasks\.parquet lacks task 7, which episode 0 has: correct the dataset"),
     (column(EPISODES, f"{VIDEO}chunk_index", "../../x"), COUNT),
     (column(EPISODES, "episode_index", 1.5), COUNT),
     (column(EPISODES, "episode_index", 0), "lists episode 0 more than once: correct"),
     *((column(EPISODES, f"{VIDEO}from_timestamp", value), "hold seconds") for value in (NAN, -1e18, "0")),
-    *((column(ROWS, "action", value), NUMBERS) for value in ("push", ["a", "b", "c"])),
+    (column(ROWS, "action", "push"), NUMBERS),
     (column(ROWS, "action", [0.0, 0.0]), NO_NUMBERS),
     (column(ROWS, "episode_index", None), COUNT),
-    (
-        column(ROWS, "action", not_finite),
-        r"action is nan at index 1 in episode 1, step 3, as in 1 other steps: correct",
-    ),
+    (column(ROWS, "action", not_finite), r"action is nan at index 1 in episode 1, step 3, the first of 2: correct"),
     (
         stamped(lambda times: times * 1.2),
         r"step 3 of episode 1 comes 0\.36 s after its first one, but at 10 Hz, .* 0\.3",
@@ -456,14 +440,6 @@ def test_what_is_wrong_with_a_dataset_is_said_before_anything_is_imported(
         demonstrations(changed(home, tmp_path / "dataset", change), ARM_SPEC)
     assert str(tmp_path) in str(caught.value) and len(str(caught.value)) < 2000
     assert "correct" not in says or "copy" in says or "copy the dataset" not in str(caught.value)
-
-
-def test_a_description_tells_what_is_wrong_too(home: Path, tmp_path: Path) -> None:
-    for name, change in (("half", without_second), ("numbers", column(ROWS, "action", not_finite))):
-        with pytest.raises(ValueError, match=r"lists 2 of the 3 episodes|is nan at index 1 in episode 1, step 3"):
-            recording(changed(home, tmp_path / name, change))
-    with pytest.raises(ValueError, match=r"expert\.folder=DIR"):
-        demonstrations(None, ARM_SPEC)
 
 
 def test_images_that_drift_away_from_their_steps_are_refused(tmp_path: Path) -> None:
@@ -492,18 +468,16 @@ def test_a_table_larger_than_recordings_are_is_not_read(
 
 
 @pytest.mark.parametrize(
-    ("rows", "shape", "fits"),
+    ("rows", "size", "fits"),
     [
-        ([[1.0] * 6, [2.0] * 6], (6,), True),
-        ([[1.0] * 5, [2.0] * 7], (6,), False),
-        ([[1, 2], None], (2,), False),
-        ([1.0, 2.0], (1,), True),
-        ([[[1, 2], [3, 4]]], (2, 2), True),
-        ([[[1], [2, 3, 4]]], (2, 2), False),
+        ([[1.0] * 6, [2.0] * 6], 6, True),
+        ([[1.0] * 5, [2.0] * 7], 6, False),
+        ([[1, 2], None], 2, False),
+        ([1.0, 2.0], 1, True),
     ],
 )
-def test_rows_of_other_lengths_are_no_array(rows: Any, shape: tuple[int, ...], fits: bool) -> None:
-    found = tables.array(pa.chunked_array([pa.array(rows)]), *shape)
+def test_rows_of_other_lengths_are_no_vectors(rows: Any, size: int, fits: bool) -> None:
+    found = tables.vectors(pa.chunked_array([pa.array(rows)]), size)
     assert found.ravel().tolist() == np.ravel(rows).tolist() if fits and found is not None else found is None
 
 

@@ -59,9 +59,9 @@ def test_padded_rows_and_other_encodings_are_understood() -> None:
     ("changed", "reason"),
     [
         ({"encoding": "16UC1"}, "encoding is '16UC1'"),
-        ({"data": b"abc"}, "3 bytes, 2 rows of 9 are 18"),
-        ({"step": 8}, "step is 8 bytes, 3 pixels of rgb8 need 9"),
-        ({"step": 10}, "2 rows of 10"),
+        ({"data": b"abc"}, "3 by 2 pixels of rgb8 has 3 bytes in rows of 9"),
+        ({"step": 8}, "18 bytes in rows of 8"),
+        ({"step": 10}, "18 bytes in rows of 10"),
         ({"encoding": "x" * 10**6}, "encoding is 'x{79}…', expected"),
         ({"height": 0, "data": b""}, "3 by 0 pixels"),
         ({"height": 2**31, "width": 2**31, "step": 2**33}, "18 bytes"),
@@ -85,10 +85,10 @@ def test_a_compressed_image_is_decoded(kind: str, mode: str) -> None:
 def test_a_compressed_image_that_is_none_is_refused(damage: Any) -> None:
     data, depth = io.BytesIO(), io.BytesIO()
     Image.fromarray(np.zeros((4, 5), np.uint16)).save(depth, "PNG")
-    with pytest.raises(ValueError, match=r"'16UC1; compressedDepth' has 5 by 4 pixels of I;16"):
+    with pytest.raises(ValueError, match=r"the image is 4 x 5 pixels of I;16"):
         messages.image_from(SimpleNamespace(format="16UC1; compressedDepth", data=depth.getvalue()))
     Image.fromarray(PIXELS.repeat(30, 0).repeat(30, 1)).save(data, "PNG")
-    with pytest.raises(ValueError, match="image of format 'png' is not a JPEG or PNG, or is damaged"):
+    with pytest.raises(ValueError, match="the image cannot be decoded"):
         messages.image_from(SimpleNamespace(format="png", data=damage(data.getvalue())))
 
 
@@ -96,7 +96,7 @@ def test_fingers_may_come_in_messages_of_their_own() -> None:
     states = messages.JointStates(ROBOT)
     arm = SimpleNamespace(name=["two", "one"], position=[2.0, 1.0], velocity=[])
     fingers = SimpleNamespace(name=["left", "right"], position=[0.02, 0.01], velocity=[])
-    with pytest.raises(ValueError, match="joint state lacks left, right; it has two, one"):
+    with pytest.raises(ValueError, match=r"joint state lacks left, right, .* it has two, one"):
         states.read(arm, 0.0)
     assert states.read(fingers, 1.0) is None
     position, _, opening = states.read(arm, 1.4) or pytest.fail("it has the arm")
@@ -120,7 +120,7 @@ def test_joints_are_found_by_name() -> None:
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
-        ({"name": ["left", "two", "elsewhere", "three", "right"]}, "lacks one; it has left, two"),
+        ({"name": ["left", "two", "elsewhere", "three", "right"]}, "lacks one, .* it has left, two"),
         ({"name": ["left", "two", "one", "one", "right"]}, "twice"),
         ({"position": [1.0]}, "5 names, 1 positions"),
         ({"velocity": [1.0]}, "1 velocities"),
@@ -140,10 +140,9 @@ def test_a_gripper_may_report_further_joints() -> None:
     assert arm is not None and arm[2] == pytest.approx(0.03)
 
 
-def test_a_command_goes_there_and_back() -> None:
-    message = commands.joint_state(ROBOT, Command(np.array([0.1, 0.2]), np.array([1.0, 2.0]), 0.5))
-    assert message.name == ["one", "two", "left", "right"] and len(message.velocity) == len(message.effort) == 0
-    position, opening = messages.command_from(message.name, message.position, ROBOT)
+def test_a_command_is_read_by_name() -> None:
+    names = ["one", "two", "left", "right"]
+    position, opening = messages.command_from(names, [0.1, 0.2, 0.02, 0.02], ROBOT)
     assert position.tolist() == [0.1, 0.2] and opening == pytest.approx(0.5)
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +16,20 @@ import pytest
 import torch
 from composing import composed
 from defaults import defaults_of
-from fake_batch import as_policy, make_decoder, make_denoising, make_rt1
+from fake_batch import as_policy, make_bc, make_decoder, make_denoising, make_rt1
 from observing import act, observations
-from toy import SPEC
+from torch import Tensor
+from torch.export import ExportedProgram
+from toy import SPEC, ToyEnvironment
 
 from vla.config.experiment import Experiment
-from vla.deploy.onnx_policy import OnnxPolicy
+from vla.deploy.onnx_policy import OnnxPolicy, Program, capture, inputs_of, open_onnx, write_programs
+from vla.models.decoder import Decoder
+from vla.models.diffusion import Diffusion
 from vla.models.flow import Flow
 from vla.models.model import Model
+from vla.models.rt1 import RT1
+from vla.models.text.ngrams import NGrams
 from vla.models.tokenizers.fast import Fast
 
 pytestmark = pytest.mark.usefixtures("faster_exports")
@@ -76,7 +85,7 @@ def test_programs_are_exported_once_for_the_same_weights_and_options(
 
     exported = []
     monkeypatch.setattr("vla.deploy.onnx_policy.write_programs", lambda *arguments: exported.append(arguments[1]))
-    monkeypatch.setattr("vla.deploy.onnx_policy.open_onnx", lambda path, threads: path)
+    monkeypatch.setattr("vla.deploy.onnx_policy.open_onnx", lambda path: path)
     as_onnx(model, tmp_path)
     assert exported == []
     model.temperature *= 2  # type: ignore[operator]
@@ -87,27 +96,10 @@ def test_programs_are_exported_once_for_the_same_weights_and_options(
     assert len({programs, *exported}) == 3
 
 
-def leads(probabilities: np.ndarray, reach: int) -> np.ndarray:
-    """By how much the window of bins that is decoded is likelier than others, (D,), given probabilities (D, K)."""
-    windows = np.stack([np.convolve(each, np.ones(2 * reach + 1), "same") for each in probabilities])
-    beside = np.abs(np.arange(windows.shape[1]) - windows.argmax(1, keepdims=True)) <= 1
-    return 1 - np.where(beside, 0, windows).max(1) / windows.max(1)
-
-
-def test_a_checkpoint_acts_through_its_programs_quantised_ones_about_like_the_model(home: Path, tmp_path: Path) -> None:
-    def policy(*overrides: str) -> Any:
-        return Experiment.of(composed(f"checkpoint={home}/run", *overrides)).make_policy()()
-
-    model, onnx = policy(), policy("policy=onnx", "policy.quantize=true", f"policy.folder={tmp_path}")
-    span, random = np.subtract(model.spec.high, model.spec.low), np.random.default_rng(0)
-    apart, lead = list[Any](), list[Any]()
-    for _ in range(8):
-        seen = model.spec.random_observation(random)
-        apart.append(np.abs(onnx.act(seen) - model.act(seen)) / span)
-        lead.append(leads(model.info["probabilities"], model.model.tokenizer.reach))
-    # After four steps all bins are about as probable: where no window of them leads, another one may be decoded.
-    decided = np.array(lead) > 5e-4
-    assert decided.mean() > 0.5 and np.array(apart)[decided].max() < 1e-3 and np.max(apart) > 1e-7
+def test_a_checkpoint_acts_through_its_programs(home: Path, tmp_path: Path) -> None:
+    asked = composed(f"checkpoint={home}/run", "policy=onnx", f"policy.folder={tmp_path}")
+    onnx: Any = Experiment.of(asked).make_policy()()
+    assert onnx.act(onnx.spec.random_observation(np.random.default_rng(0))).shape == (len(onnx.spec.action),)
     assert onnx.lanes == 1  # a server plans for one client at a time
 
 
@@ -116,3 +108,54 @@ def test_a_model_that_cannot_be_exported_is_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="Decoder with Fast cannot be exported"):
         as_onnx(make_decoder(chunk=4, tokenizer=tokenizer, layers=1), tmp_path)
     assert [path for path in tmp_path.iterdir() if path.is_dir()] == []
+
+
+@pytest.mark.parametrize(  # models with short programs
+    "make",
+    [
+        lambda: make_bc(chunk=2),
+        lambda: make_bc(text=partial(NGrams, **defaults_of("model/text/known_words"))),
+        lambda: make_rt1(proprioception=True, layers=1),
+        lambda: make_decoder(layers=1),
+        lambda: make_denoising(Diffusion, layers=1, steps=2),
+    ],
+    ids=["bc", "known words", "rt1 with kept tokens", "decoder", "diffusion"],
+)
+def test_the_programs_act_like_the_policy_for_any_instruction(make: Callable[[], Model], tmp_path: Path) -> None:
+    policy = as_policy(make())
+    write_programs(policy, folder := tmp_path / "program")
+    report = json.loads((folder / "program.json").read_text())
+    assert report["spec"] == SPEC.to_dict() and report["act"]["difference"] < 1e-3
+    encoders = {"encode.onnx"} if "encode" in report else set()
+    assert {path.name for path in folder.iterdir()} == {"act.onnx", "program.json", *encoders}
+    assert bool(encoders) == isinstance(policy.model, (RT1, Decoder))
+    if isinstance(policy.model, RT1):  # which keeps tokens, and so encodes one frame at a time
+        assert report["encode"]["inputs"]["eye"] == {"dtype": "uint8", "shape": [1, 1, *SPEC.image_size, 3]}
+        assert report["act"]["inputs"]["tokens"]["shape"] == [1, 3, 4, 32]
+
+    instruction = "please do something that takes a good many more words than the example had"
+    policy.reset(instruction, 0)
+    expected = policy.plan(replace(ToyEnvironment().reset(0), instruction=instruction))
+    window, drawn = policy.window(), policy.model.sample_noise(torch.Generator().manual_seed(0))
+    inputs = inputs_of(window if drawn is None else {**window, "noise": drawn})
+    actions = open_onnx(folder / "act.onnx")(inputs).numpy()
+    assert np.clip(actions[0], SPEC.low, SPEC.high) == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize(("program", "wrong"), [("encode", float("nan")), ("act", 0.01)])
+def test_a_program_that_differs_is_not_written(
+    program: str, wrong: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def captured(whole: Program, inputs: dict[str, Tensor]) -> ExportedProgram:
+        if whole.part != program:
+            return capture(whole, inputs)
+        changed = Program(deepcopy(whole.model), whole.part)
+        bias = changed.model.context.image_tokens.bias if program == "encode" else changed.model.head.bias  # type: ignore[union-attr]
+        with torch.no_grad():
+            bias[0] += 1000 * wrong  # type: ignore[index,operator]
+        return capture(changed, inputs)
+
+    monkeypatch.setattr("vla.deploy.onnx_policy.capture", captured)
+    with pytest.raises(ValueError, match=r"\.onnx differs from the model"):
+        write_programs(as_policy(make_rt1(layers=1)), tmp_path / "program")
+    assert not list(tmp_path.iterdir())

@@ -14,7 +14,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from fake_batch import as_policy, make_bc
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import GetState
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
@@ -23,7 +22,7 @@ from world import KINDS, World, positions
 
 from vla.deploy.client_observation import Keys
 from vla.deploy.safety import State
-from vla.robots.panda import HOME, forward
+from vla.robots.panda import HOME
 
 pytestmark = pytest.mark.realtime
 
@@ -40,26 +39,21 @@ def world(make_world: Callable[..., World]) -> World:
     return world
 
 
-def test_the_first_command_is_the_measured_pose_and_the_arm_then_moves(world: World) -> None:
-    first = world.commands[0]
-    assert first.name == [*ROBOT.joints, *ROBOT.fingers]
-    np.testing.assert_allclose(first.position[:7], HOME)
-    assert list(first.velocity) == list(first.effort) == []
-    world.live(0.5)
-    steps = np.diff([command.position[:7] for command in world.commands], axis=0)
-    assert np.abs(steps).sum() > 0.1
-    assert (np.abs(steps) <= ROBOT.max_speed * 0.02 + 1e-9).all()
-    assert world.statuses[-1].level == DiagnosticStatus.OK
-
-
-def test_observations_are_those_of_the_messages(world: World) -> None:
-    seen = world.policy.seen[-1]
+def test_observations_are_those_of_the_messages_and_move_the_arm_from_its_measured_pose(world: World) -> None:
+    seen, first = world.policy.seen[-1], world.commands[0]
     assert seen.instruction == "put the red block on the pad" and set(seen.rgb) == {"front", "wrist"}
     assert seen.state[14] == pytest.approx(0.08) and seen.truth is None
     assert np.abs(seen.state[:7] - world.joints).max() < 0.2  # in the order of the spec, not of the message
+    assert first.name == [*ROBOT.joints, *ROBOT.fingers]
+    np.testing.assert_allclose(first.position[:7], HOME)
+    assert list(first.velocity) == list(first.effort) == []
     world.live(1.0)
+    steps = np.diff([command.position[:7] for command in world.commands], axis=0)
+    assert np.abs(steps).sum() > 0.1
+    assert (np.abs(steps) <= ROBOT.max_speed * 0.02 + 1e-9).all()
     status = {pair.key: pair.value for pair in world.statuses[-1].values}
     assert status["state"] == "running" and float(status["inference p99 [ms]"]) > 0
+    assert world.statuses[-1].level == DiagnosticStatus.OK
 
 
 def test_a_bug_in_a_callback_stops_the_arm_and_not_the_process(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,9 +98,7 @@ def test_invalid_images_hold_the_arm(world: World, change: Any, words: str, capf
     assert words in capfd.readouterr().err
 
 
-def test_simulated_time_stamps_the_images_and_holds_the_arm_when_it_is_frozen(
-    make_world: Callable[..., World],
-) -> None:
+def test_simulated_time_stamps_the_images_and_holds_the_arm_when_it_is_frozen(make_world: Callable[..., World]) -> None:
     world = make_world("joint_state", "--ros-args", "-p", "use_sim_time:=true")
     world.simulated = 50.0
     world.start()
@@ -265,7 +257,7 @@ def test_deactivation_brakes_first(world: World) -> None:
 @pytest.mark.parametrize("command", KINDS)
 def test_limits_hold_from_one_message_to_the_next(make_world: Callable[..., World], command: str) -> None:
     """A controller replaces the rest of a trajectory by the next one, while the goals jump."""
-    world = make_world(command, "--ros-args", "-p", "speed_share:=0.25", "-p", "acceleration_share:=0.05")
+    world = make_world(command, robot=replace(ROBOT, speed_share=0.25, acceleration_share=0.05))
     generator = np.random.default_rng(0)
     world.policy.action = lambda: generator.uniform(SPEC.low, SPEC.high, (1, 7)).astype(np.float32)
     world.start()
@@ -294,36 +286,10 @@ def test_trajectories_end_at_rest_and_plain_positions_have_fingers_of_their_own(
     assert list(fingers[-1].data) == [0.04, 0.04]
 
 
-def test_a_twist_for_a_servo_moves_the_tool_as_fast_as_the_policy_says(make_world: Callable[..., World]) -> None:
-    world = make_world("twist")
-    world.start()
-    before = forward(world.joints)[0][:3, 3]
-    world.live(1.0)
-    moved = forward(world.joints)[0][:3, 3] - before
-    assert world.state is State.RUNNING and world.commands[-1].header.frame_id == "panda_link0"
-    assert moved[0] > 0.02 and np.abs(moved[1:]).max() < 0.2 * moved[0]
-
-
-def test_ros_arguments_remap_and_set_parameters(make_world: Callable[..., World]) -> None:
-    world = make_world("joint_state", "--ros-args", "-r", "/front:=/isaac/front", "-p", "speed_share:=0.5")
+def test_ros_arguments_remap(make_world: Callable[..., World]) -> None:
+    world = make_world("joint_state", "--ros-args", "-r", "/front:=/isaac/front")
     assert world.change(Transition.TRANSITION_CONFIGURE)
-    assert world.agent.loop is not None and world.agent.loop.limits.speed_share == 0.5
     assert any(name == "/isaac/front" for name, _ in world.agent.get_topic_names_and_types())
-
-
-def test_speed_is_lowered_at_any_time_and_raised_at_rest_only(world: World) -> None:
-    def set_share(value: float) -> Any:
-        return world.agent.set_parameters([Parameter("speed_share", value=value)])[0]
-
-    assert set_share(0.1).successful
-    assert world.agent.loop is not None and world.agent.loop.limits.speed_share == 0.1
-    assert "deactivate" in set_share(0.5).reason
-    assert not set_share(2.0).successful
-    together = [Parameter("speed_share", value=0.05), Parameter("acceleration_share", value=0.5)]
-    assert not world.agent.set_parameters_atomically(together).successful
-    assert world.agent.loop.limits.speed_share == 0.1
-    assert world.change(Transition.TRANSITION_DEACTIVATE)
-    assert set_share(0.5).successful
 
 
 def test_a_robot_that_does_not_fit_refuses_to_configure(make_world: Callable[..., World]) -> None:

@@ -113,7 +113,7 @@ def test_parts_of_a_dataset_are_chosen_by_name(dataset: Path) -> None:
     np.testing.assert_array_equal(found.actions, there.actions[[4, 9, 11]][:, [2, 0]])
     np.testing.assert_array_equal([seen.state for seen in found.observations], (there.actions - 1)[[0, 5, 10]])
     for seen, original in zip(found.observations, there.observations[::5], strict=True):
-        expected = resize(original.rgb["hand"], (12, 12), "centre")
+        expected = resize(original.rgb["hand"], (12, 12))
         assert seen.rgb["eye"].shape == (12, 12, 3)
         assert np.abs(seen.rgb["eye"].astype(int) - expected).max() <= 4
 
@@ -196,10 +196,7 @@ def test_outliers_do_not_widen_the_bounds_and_rare_events_do() -> None:
         (["expert.folder=nowhere"], "error: there is no LeRobot dataset in nowhere"),
         (["task.action=[elbow]"], r"error: task.action names elbow, the recording has joint1.pos"),
         (["task.units={elbow: rad}"], "error: task.units names elbow, the components are joint1.pos"),
-        (
-            ["agent=remote", "agent.images.top=top"],
-            "; +agent.images.top=VALUE adds it",
-        ),
+        (["agent=remote", "agent.images.top=top"], "; +agent.images.top=VALUE adds it"),
         (["validate.episodes=3"], "validate.episodes=3: nothing can be played in a recording"),
         (["job=preview"], "the task has no simulator, only recordings, so nothing can be played in it"),
     ],

@@ -180,13 +180,6 @@ def test_the_nearest_demonstration_is_evaluated_like_a_policy_and_beside_one(hom
     assert refused.stderr.count("\n") == 1 and "no episode store in nowhere" in refused.stderr
 
 
-def test_a_policy_is_exported_as_programs(home: Path) -> None:
-    policy = ("checkpoint=run", "export=program", "export.folder=program")
-    here(home, "job=export", *policy)
-    written = json.loads((home / "program/program.json").read_text())
-    assert written["act"]["difference"] < 1e-3 and (home / "program/act.onnx").is_file()
-
-
 def test_an_evaluation_ends_when_what_it_is_asked_is_decided(home: Path) -> None:
     policy = ("checkpoint=run", "cluster.workers=1", "task.time_limit=0.2", "recorder=none")
     asked = (*policy, "evaluate.episodes=40", "evaluate.until=decided", "evaluate.margin=0.9")

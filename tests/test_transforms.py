@@ -54,9 +54,15 @@ def test_any_size_is_taken_and_the_size_itself_is_left_alone(fit: Fit) -> None:
 
 def test_what_importers_store_is_what_a_policy_makes_of_the_same_picture() -> None:
     image = np.random.default_rng(0).integers(256, size=(90, 120, 3), dtype=np.uint8)
-    for fit, crop in (("crop", "centre"), ("stretch", "none")):
-        difference = resized(image, (48, 48), fit).astype(int) - resize(image, (48, 48), crop)
-        assert np.abs(difference).max() <= 1 and (difference == 0).mean() > 0.98
+    np.testing.assert_array_equal(resized(image, (48, 48), "crop"), resize(image, (48, 48)))
+    assert resize(image, (90, 120)) is image
+
+
+def test_every_pixel_counts() -> None:
+    """Pixels that a small image leaves out would flicker where an edge moves."""
+    stripes = np.zeros((960, 960, 3), np.uint8)
+    stripes[:, ::2] = 255
+    assert np.abs(resize(stripes, (96, 96)) - 127.5).max() < 4
 
 
 def raw_world() -> ToyEnvironment:

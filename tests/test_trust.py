@@ -95,7 +95,6 @@ def test_nothing_that_a_policy_names_is_run(tmp_path: Path, attack: str, monkeyp
 
     ways: dict[str, Callable[[], Any]] = {
         "evaluate": adopted(),
-        "export": adopted("job=export", "export=program", f"export.folder={tmp_path}/new"),
         "deploy": adopted("job=deploy", "deploy=ros2"),
         "benchmark": adopted("job=benchmark"),
         "resume": lambda: run_job(resume(composed(f"output={path}"), path, [])),

@@ -183,7 +183,7 @@ def test_linear_maps_in_another_layout_compute_the_same_and_follow_their_weights
 def written(folder: Path, tokenizer: Path, change: Callable[[dict[str, Any]], None] | None = None) -> Path:
     """A published policy of random weights."""
     model = make_smolvla(tokenizer)
-    LeRobotPolicyExporter(folder).export_policy(as_policy(model, SPEC))
+    LeRobotPolicyExporter(folder).export(as_policy(model, SPEC))
     if change:
         path = folder / "model.safetensors"
         weights = load_file(path)

@@ -15,7 +15,6 @@ from arm import FORWARD, ROBOT, SAFETY, SPEC
 from builtin_interfaces.msg import Time
 from defaults import defaults_of
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import TwistStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from PIL import Image as Picture
@@ -27,18 +26,19 @@ from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
 
 from vla.deploy import messages
+from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.policy_node import PolicyNode
 from vla.deploy.ros import RosNetwork
 from vla.deploy.ros2 import PolicyDeployment
 from vla.deploy.safety import State
 from vla.deploy.settings import Topics
-from vla.robots.panda import HOME, forward
+from vla.robots.panda import HOME
 from vla.spec import Array, Observation
 
 TOPICS = Topics({"front": "/front", "wrist": "/wrist"}, "/joint_states", "/words", "/commands", "/gripper", None)
 KINDS = {"joint_state": JointState, "trajectory": JointTrajectory, "forward": Float64MultiArray}
 TOPIC = {"follow_joint_trajectory": "/vla_agent/commands"}  # of the commands, where it is not /commands
-OTHERS = {"twist": TwistStamped, "follow_joint_trajectory": JointState}
+OTHERS = {"follow_joint_trajectory": JointState}
 
 
 class Forward:
@@ -76,6 +76,7 @@ class World:
         compressed: bool = False,
         gripper: Any = None,
         dry_run: bool = False,
+        robot: JointLimits = ROBOT,
     ) -> None:
         RosNetwork.named("loopback").apply()
         self.contexts = [Context(), Context()]
@@ -86,7 +87,7 @@ class World:
         self.compressed = compressed
         topics = {camera: f"/{camera}{'/compressed' if compressed else ''}" for camera in SPEC.cameras}
         self.settings = PolicyDeployment(
-            robot=ROBOT,
+            robot=robot,
             network=RosNetwork.named("loopback"),
             topics=replace(TOPICS, images=topics),
             safety=SAFETY,
@@ -138,8 +139,6 @@ class World:
             if self.measures:
                 if self.follow is not None:
                     self.joints = self.follow(self.joints)
-                elif self.commands and isinstance(self.commands[-1], TwistStamped):
-                    self.joints = self.joints + 0.02 * rates(self.commands[-1], self.joints)
                 elif self.commands:
                     self.joints = positions(self.commands[-1])[0]
                 self.states.publish(joint_state(self.joints))
@@ -207,14 +206,6 @@ def positions(command: Any) -> Array:
     if isinstance(command, JointTrajectory):
         return np.array([point.positions for point in command.points])
     return np.array([command.position[:7] if isinstance(command, JointState) else command.data])
-
-
-def rates(command: TwistStamped, joints: Array) -> Array:
-    """Return the joint velocities (7,) [rad/s] that a servo would choose for a twist."""
-    linear, angular = command.twist.linear, command.twist.angular
-    twist = np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
-    velocities: Array = np.linalg.pinv(forward(joints)[1]) @ twist
-    return velocities
 
 
 def joint_state(joints: Array) -> JointState:

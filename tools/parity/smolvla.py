@@ -128,7 +128,7 @@ def compare_policies(folder: Path) -> dict[str, Tensor]:
     write_tokenizer(folder / "tokenizer")
     model = make_smolvla(folder / "tokenizer")
     ours = as_policy(model, SPEC)
-    LeRobotPolicyExporter(folder / "exported").export_policy(ours)
+    LeRobotPolicyExporter(folder / "exported").export(ours)
     without_hub(SMOLVLA)
     theirs = SmolVLAPolicy.from_pretrained(folder / "exported", strict=False)
     weights = dict(theirs.model.named_parameters())

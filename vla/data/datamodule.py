@@ -51,14 +51,26 @@ class Prefetcher:
         make_batch: windows (B,) → batch.
         plan: returns the windows of every batch, in order.
         ahead: number of batches made in advance.
+        batches: their number; None: endless.
 
     Attributes:
         waited: total time that the consumer waited for batches [s].
     """
 
-    def __init__(self, make_batch: Callable[[Array], Batch], plan: Callable[[], Iterable[Array]], ahead: int) -> None:
-        self._make_batch, self._plan, self._ahead = make_batch, plan, ahead
+    def __init__(
+        self,
+        make_batch: Callable[[Array], Batch],
+        plan: Callable[[], Iterable[Array]],
+        ahead: int,
+        batches: int | None = None,
+    ) -> None:
+        self._make_batch, self._plan, self._ahead, self._batches = make_batch, plan, ahead, batches
         self.waited = 0.0
+
+    def __len__(self) -> int:
+        if self._batches is None:
+            raise TypeError("endless")
+        return self._batches
 
     def __iter__(self) -> Iterator[Batch]:
         maker = ThreadPoolExecutor(1, "windows")  # unlike a daemon thread, joined at exit
@@ -78,13 +90,6 @@ class Prefetcher:
         made = batch.result()
         self.waited += time.perf_counter() - started
         return made
-
-
-class SizedPrefetcher(Prefetcher):
-    """Prefetcher of a known number of batches; the trainer takes one without a length for endless."""
-
-    def __len__(self) -> int:
-        return len(list(self._plan()))
 
 
 class WindowDataModule(LightningDataModule):
@@ -172,7 +177,7 @@ class WindowDataModule(LightningDataModule):
         """Return endless batches, from the trainer's current step on."""
         return Prefetcher(self._make_batch, self._training_plan, self.ahead)
 
-    def val_dataloader(self) -> SizedPrefetcher | list[Batch]:
+    def val_dataloader(self) -> Prefetcher | list[Batch]:
         """Return the validation batches, the same every time."""
         if not len(self.held_out_windows):
             return []
@@ -182,7 +187,7 @@ class WindowDataModule(LightningDataModule):
         # Whole batches: one shape for a compiled model, and the same number of steps in all processes.
         spread = np.linspace(0, len(self.held_out_windows) - 1, batches * share).round().astype(np.int64)
         windows = self.held_out_windows[spread].reshape(batches, self.batch_size, processes)
-        return SizedPrefetcher(self._make_batch, lambda: windows[:, :, rank], self.ahead)
+        return Prefetcher(self._make_batch, lambda: windows[:, :, rank], self.ahead, batches)
 
     def order(self, step: int, rank: int = 0, processes: int = 1) -> Array:
         """Return the windows (B,) of training step `step` in process `rank`, as row numbers.

@@ -28,15 +28,13 @@ Chosen = dict[str, dict[int, list[tuple[EpisodeStore, Entry]]]]  # config as JSO
 def derive_store(
     stores: Sequence[EpisodeStore], folder: Path, where: Mapping[str, Any] | None = None, repair: bool = False
 ) -> list[int]:
-    """Write a new store of the episodes in others of the same spec that match `where`, atomically.
+    """Write a new store of the episodes in others of the same spec that match `where`, atomically (UserError: the
+    folder exists, specs differ, nothing matches, or an episode is damaged).
 
     Seeds are in order, config by config. Of the same seed and config one undamaged episode is kept. If all seeds
     between the first and the last of a single config exist, the new store equals a collected one, and can grow. With
     `repair` the sources may be damaged, and an episode that is damaged in all of them becomes a failed seed. Returns
     these seeds.
-
-    Raises:
-        UserError: the folder exists, specs differ, nothing matches, or an episode is damaged.
     """
     if folder.exists():
         raise UserError(f"{folder} exists already and is left alone: choose another inspect.into")

@@ -38,14 +38,12 @@ def leaves(value: Any) -> list[Any]:
 
 
 def episode_filter(where: Mapping[str, Any], entries: Iterable[Entry]) -> Callable[[Entry], bool]:
-    """Return the predicate of index entries that have a value of every name in `where`, and whose values all match.
+    """Return the predicate of index entries that have a value of every name in `where`, and whose values all match
+    (UserError: a name occurs in no entry, or a condition is of another kind).
 
     Args:
         where: name of a fact → condition.
         entries: the entries to filter; each name must occur in one of them.
-
-    Raises:
-        UserError: a name occurs in no entry, or a condition is of another kind.
     """
     known = dict.fromkeys(name for entry in entries for name in _facts(entry))
     for name in where:

@@ -50,7 +50,8 @@ class DamageError(UserError):
 
 
 class EpisodeStore:
-    """Episodes on disk, opened for reading; `create_or_open` and `writing` extend it.
+    """Episodes on disk, opened for reading; `create_or_open` and `writing` extend it (UserError: the folder holds no
+    store, or one that has another format, is damaged, or is too short).
 
     Attributes:
         header: content of `store.json`.
@@ -65,9 +66,6 @@ class EpisodeStore:
         folder: of the store.
         episodes: use only the first so many; all of them when None.
         damaged: also open a store with truncated files or unreadable index lines; the seeds of the latter are `LOST`.
-
-    Raises:
-        UserError: the folder holds no store, or one that has another format, is damaged, or is too short.
     """
 
     def __init__(self, folder: str | Path, episodes: int | None = None, damaged: bool = False) -> None:
@@ -87,11 +85,8 @@ class EpisodeStore:
     def create_or_open(
         cls, folder: str | Path, spec: Spec, config: Mapping[str, Any], codec: Codec | None = None
     ) -> EpisodeStore:
-        """Open the store in `folder`, or create an empty one, whose codec is by default that for its size of images.
-
-        Raises:
-            UserError: the store has another spec or config, other losses than `codec`, or lacks its `store.json`.
-        """
+        """Open the store in `folder`, or create an empty one, whose codec is by default that for its size of images
+        (UserError: the store has another spec or config, other losses than `codec`, or lacks its `store.json`)."""
         folder, plain = Path(folder), json.loads(dumps(config))
         if not is_store(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -238,13 +233,10 @@ class EpisodeStore:
                 os.fsync(file.fileno())
 
     def append(self, episode: Episode, packed: Mapping[str, Sequence[bytes]] | None = None) -> None:
-        """Store an episode atomically: a success, or a failure whose labels are to be kept.
+        """Store an episode atomically: a success, or a failure whose labels are to be kept (UserError: it does not
+        match the spec, has several instructions or another seed than the next, or cannot be written).
 
         `packed` are its images as another store with the same codec keeps them: JPEG is not compressed a second time.
-
-        Raises:
-            UserError: it does not match the spec, has several instructions or another seed than the next, or cannot be
-                written.
         """
         if len({seen.instruction for seen in episode.observations}) > 1:
             raise UserError(

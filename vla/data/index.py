@@ -97,11 +97,7 @@ def index_line(entry: Entry) -> bytes:
 
 
 def parse_line(line: bytes, name: str) -> Entry:
-    """Decode a line without its line end.
-
-    Raises:
-        UserError: the line is damaged; the message begins with `name`.
-    """
+    """Decode a line without its line end (UserError: the line is damaged; the message begins with `name`)."""
     body = line.rpartition(CHECK)[0] + b"}"
     if _sealed(body) != line:
         raise UserError(f"{name} is damaged: it does not fit its checksum")
@@ -136,12 +132,10 @@ def listed(numbers: Sequence[int]) -> str:
 
 
 def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], int]:
-    """Return the entries and their size in bytes, without an incomplete last line.
+    """Return the entries and their size in bytes, without an incomplete last line (UserError: lines are damaged, and
+    named in the message, or do not follow each other).
 
     Unless `any_seed`, seeds are consecutive, which identifies the `LOST` ones in a `damaged` index.
-
-    Raises:
-        UserError: lines are damaged, and named in the message, or do not follow each other.
     """
     lines = _lines(path)
     entries: dict[int, Entry] = {}  # line number → entry

@@ -89,11 +89,8 @@ def require_whole(report: StoreReport) -> None:
 
 
 def find_episode(store: EpisodeStore, seed: int) -> tuple[dict[str, Any], Episode]:
-    """Return the config and the episode of a seed.
-
-    Raises:
-        UserError: the seed was not tried, failed or occurs twice, or its episode is damaged.
-    """
+    """Return the config and the episode of a seed (UserError: the seed was not tried, failed or occurs twice, or its
+    episode is damaged)."""
     tried = [(config, entry) for config, entries in entries_by_config(store) for entry in entries if entry.seed == seed]
     stored = [(config, entry) for config, entry in tried if entry.stored]
     if not tried:

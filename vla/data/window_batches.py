@@ -119,16 +119,14 @@ class WindowBatcher:
         self._last = np.array([entry.end - 1 for entry in entries])
 
     def __call__(self, windows: Array) -> Batch:
-        """Return the batch of `windows` (B,), row numbers.
+        """Return the batch of `windows` (B,), row numbers (UserError: images of these episodes differ from their
+        checksums, which are compared once per episode).
 
         A frame before the start of the episode is zero, absent, and has no valid label. A label is also invalid if a
         step between its frame and itself was perturbed, or if it lies beyond the end of the episode, where it repeats
         the last action. The valid labels of a frame therefore come first. `perturbations` (B, T, k): perturbed steps
         between a frame and each label, -1 beyond the episode. `unperturbed` (B, T): no step within a chunk was
         perturbed.
-
-        Raises:
-            UserError: images of these episodes differ from their checksums, which are compared once per episode.
         """
         episode = self._first.searchsorted(windows, side="right") - 1  # (B,)
         if not self._verified[episode].all():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -16,6 +17,22 @@ PATIENCE = 5.0  # longest wait for a server at the start [s]
 ANSWER = 1.0  # longest time until a server accepts or rejects a goal [s]
 
 
+@dataclass(eq=False)
+class _Sent:
+    """A goal that was sent."""
+
+    at: float
+    handle: Any = None  # once it is accepted
+    over: bool = False  # it has ended, or what becomes of it no longer counts
+    cancelled: bool = False
+
+    def cancel(self) -> None:
+        """Cancel it as soon as it is known to the server."""
+        self.cancelled = True
+        if self.handle is not None:
+            self.handle.cancel_goal_async()
+
+
 class GoalSender:
     """Sends goals to one action server, where each replaces the one before."""
 
@@ -25,108 +42,93 @@ class GoalSender:
         kind: Any,
         name: str,
         complaint: Callable[[Any, bool], str],
-        fail: Callable[[str], None],
         ended: Callable[[], None] = lambda: None,
     ) -> None:
         """Args:
-        node: sends the goals; its guard wraps the callbacks.
+        node: sends the goals, and fails with one sentence when the server refuses, gives up or vanishes.
         kind: class of the action.
         name: of the server.
         complaint: describes what went wrong from a result and whether another goal has replaced its goal; may be empty.
-        fail: called with one sentence when the server refuses, gives up or vanishes.
         ended: called when the newest goal has ended.
         """
         self.name = node.resolve_topic_name(name)
-        self._node, self.kind, self._complaint, self._fail, self._ended = node, kind, complaint, fail, ended
+        self._node, self.kind, self._complaint, self._ended = node, kind, complaint, ended
         self._client = node.add_action_client(kind, name)
-        self._newest = 0  # number of the newest goal
-        self.reset()
+        self._goals: list[_Sent] = []  # that have not ended, the newest last
+        self._failed = False
 
-    def reset(self) -> None:
-        """Reset the state of the goals; what becomes of those sent so far no longer counts."""
-        self._newest += 1
-        self._first = self._newest + 1  # number of the first goal that counts
-        self._handle: Any = None  # of the newest goal that was accepted and has not ended
-        self._unanswered: dict[int, float] = {}  # number of a goal → when it was sent
-        self._cancelled = self._rejected = self._given_up = False
-
-    def require_server(self) -> None:
-        """Raise a UserError if the server does not show up."""
+    def prepare(self) -> None:
+        """Require the server, and begin anew; raise a UserError if it does not show up."""
         if not self._client.wait_for_server(PATIENCE):
             kind = f"{self.kind.__module__.partition('.')[0]}/action/{self.kind.__name__}"
             raise UserError(
                 f"there is no action server {self.name} of {kind}: is its controller active, and on the same network "
                 "and domain?"
             )
+        self._forget()
+        self._failed = False
 
     @property
     def active(self) -> bool:
         """True from when a goal is sent until it has ended."""
-        return self._newest in self._unanswered or self._handle is not None
+        return bool(self._goals)
 
     def send(self, goal: Any) -> None:
         """Send a goal, unless the server has failed."""
-        if self._given_up:
-            return
-        self._newest += 1
-        self._unanswered[self._newest], self._cancelled = time.monotonic(), False
-        answered = self._node.guard(partial(self._on_answer, self._newest))
-        self._client.send_goal_async(goal).add_done_callback(answered)
+        if not self._failed:
+            sent = _Sent(time.monotonic())
+            self._goals.append(sent)
+            answered = self._node.guard(partial(self._on_answer, sent))
+            self._client.send_goal_async(goal).add_done_callback(answered)
 
     def cancel(self) -> None:
-        """Cancel the newest goal as soon as it is known to the server, if it has not ended by then."""
-        if self.active and not self._cancelled:
-            self._cancelled = True
-            if self._newest not in self._unanswered:
-                self._handle.cancel_goal_async()
+        """Cancel the newest goal, if it has not ended."""
+        if self._goals and not self._goals[-1].cancelled:
+            self._goals[-1].cancel()
 
     def check(self) -> None:
         """Fail if the server has vanished or does not answer."""
-        if self._given_up:
+        if self._failed:
             return
+        unanswered = [sent.at for sent in self._goals if sent.handle is None]
         if not self._client.server_is_ready():
             self._give_up("has vanished")
-        elif self._unanswered and time.monotonic() - min(self._unanswered.values()) > ANSWER:
+        elif unanswered and time.monotonic() - unanswered[0] > ANSWER:
             self._give_up(f"has not answered a goal for {ANSWER:g} s")
 
+    def _forget(self) -> None:
+        for sent in self._goals:
+            sent.over = True
+        self._goals = []
+
     def _give_up(self, what: str) -> None:
-        if self._handle is not None:
-            self._handle.cancel_goal_async()
-        self._given_up, self._handle, self._unanswered = True, None, {}
-        self._fail(f"the action server {self.name} {what}")
+        for sent in self._goals:
+            sent.cancel()
+        self._forget()
+        self._failed = True
+        self._node.fail(f"the action server {self.name} {what}")
 
-    def _on_answer(self, number: int, future: Any) -> None:
-        handle, newest = future.result(), number == self._newest
-        self._unanswered.pop(number, None)
+    def _on_answer(self, sent: _Sent, future: Any) -> None:
+        handle = future.result()
         if not handle.accepted:
-            return self._on_rejection() if newest and not self._given_up else None
-        if self._given_up or number < self._first:  # accepted too late
-            handle.cancel_goal_async()
-            return None
-        handle.get_result_async().add_done_callback(self._node.guard(partial(self._on_result, number)))
-        if newest:
-            self._handle, self._rejected = handle, False
-            if self._cancelled:
-                handle.cancel_goal_async()
-
-    def _on_rejection(self) -> None:
-        """Let a second goal follow, which brakes; if that is rejected too, cancel what the server still executes."""
-        if not self._rejected:
-            self._rejected = True
-            return self._fail(f"the action server {self.name} rejected a goal")
-        self._given_up = True
-        if self._handle is not None:
-            self._handle.cancel_goal_async()
-
-    def _on_result(self, number: int, future: Any) -> None:
-        if number < self._first:
+            if not sent.over:
+                self._give_up("rejected a goal")
             return
-        answer, newest = future.result(), number == self._newest
-        if newest:
-            self._handle = None
-        done = answer.status == GoalStatus.STATUS_SUCCEEDED or (newest and self._cancelled)
-        if not (done or self._given_up) and (complaint := self._complaint(answer.result, not newest)):
+        sent.handle = handle
+        if sent.over or sent.cancelled:  # in the meantime
+            handle.cancel_goal_async()
+        if not sent.over:
+            handle.get_result_async().add_done_callback(self._node.guard(partial(self._on_result, sent)))
+
+    def _on_result(self, sent: _Sent, future: Any) -> None:
+        if sent.over:
+            return
+        answer, newest = future.result(), sent is self._goals[-1]
+        self._goals.remove(sent)
+        sent.over = True
+        done = answer.status == GoalStatus.STATUS_SUCCEEDED or (newest and sent.cancelled)
+        if not done and (complaint := self._complaint(answer.result, not newest)):
             what = "cancelled" if answer.status == GoalStatus.STATUS_CANCELED else "aborted"
-            return self._give_up(f"{what} a goal: {complaint}")
-        if newest:
+            self._give_up(f"{what} a goal: {complaint}")
+        elif newest:
             self._ended()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -12,6 +12,8 @@ from vla.deploy.messages import shorten
 from vla.io.documents import read_yaml
 from vla.io.errors import UserError
 from vla.io.files import require_file
+
+DESCRIPTION = "metadata.yaml"  # of a bag
 
 
 @cache
@@ -27,10 +29,9 @@ def opened(folder: Path) -> Iterator[Any]:
     """Open a reader of the bag in a folder; raise a UserError if it is none, or damaged."""
     from rosbags.rosbag2 import Reader
 
-    description = folder / "metadata.yaml"
-    if not description.is_file():
-        raise UserError(f"{folder} is not a bag: it has no {description.name}")
-    read_yaml(description, dict[str, Any])  # rosbags limits neither its size nor its depth
+    if not (folder / DESCRIPTION).is_file():
+        raise UserError(f"{folder} is not a bag: it has no {DESCRIPTION}")
+    read_yaml(folder / DESCRIPTION, dict[str, Any])  # rosbags limits neither its size nor its depth
     for path in folder.iterdir():
         require_file(path)
     with bag_errors(folder):
@@ -43,13 +44,11 @@ def opened(folder: Path) -> Iterator[Any]:
 
 
 def messages_of(
-    reader: Any, connections: Sequence[Any], folder: Path, start: int | None = None, stop: int | None = None
+    reader: Any, topics: Collection[str | None], folder: Path, start: int | None = None, stop: int | None = None
 ) -> Iterator[tuple[str, int, Any]]:
-    """Yield topic, time [ns] and content of every message of some connections, from `start` to before `stop` [ns].
-
-    Raises:
-        UserError: the bag is damaged.
-    """
+    """Yield topic, time [ns] and content of every message on some topics, from `start` to before `stop` [ns]
+    (UserError: the bag is damaged)."""
+    connections = [connection for connection in reader.connections if connection.topic in topics]
     messages, types = reader.messages(connections, start, stop), message_types()
     while True:
         with bag_errors(folder):

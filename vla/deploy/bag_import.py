@@ -1,83 +1,192 @@
-"""Import of ROS 2 bags of a deployed policy, or of a person who moves the robot, as demonstrations.
+"""Import of ROS 2 bags as demonstrations: of a deployed policy, or of a person who moves the robot.
 
-Shapes: N steps, P state components, D action components.
+All times are seconds since the first message of a bag. Shapes: N steps, J joints, P state components, D action
+components.
 """
 
 from __future__ import annotations
 
-import logging
-from bisect import bisect_left
-from collections.abc import Mapping, Sequence
-from itertools import islice
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from vla.data.formats.imported_demonstrations import ImportedDemonstrations, Recording, action_bounds
+from vla.data.formats import imported_demonstrations as imported
 from vla.deploy import messages
-from vla.deploy.bag import bag_errors, messages_of, opened
-from vla.deploy.bag_index import BagIndex, Picture, Stretch, read_index
+from vla.deploy.bag import DESCRIPTION, bag_errors, messages_of, opened
+from vla.deploy.control_loop import REPEATED
 from vla.deploy.joint_limiter import JointLimits
-from vla.deploy.observer import HISTORY, Observer
+from vla.deploy.observer import HISTORY, Measured, Observer, age_of
+from vla.deploy.safety import State
 from vla.deploy.settings import Topics
 from vla.io.errors import UserError
-from vla.io.images import Crop, resize
-from vla.io.types import Text
+from vla.io.images import resize
 from vla.robots.controllers import gripper_index, recorded_controller
-from vla.spec import Array, Episode, Observation, Spec
+from vla.spec import LONGEST_INSTRUCTION, Array, Episode, Spec
 
+STATUS = "/vla_agent/status"  # end of the name of the topic that tells who moves the arm
+GAP = 0.3  # longest time between two commands of one motion [s]
 MEASURED_WITHIN = 0.2  # largest time between an observation and its joint state [s]
-ROUNDING = 1e-6  # tolerance of the action bounds
+STILL, STILL_OPENING = 0.01, 0.002  # an arm that has moved less [rad], and its gripper [m], is at rest
+LEAD = 0.1  # of a person's motion that are kept before it begins and after it ends [s]
+SHORTEST = 0.5  # shorter segments are left out [s]
 MOSTLY = 0.5  # largest share of a component's actions beyond its bounds; a larger one means other units
 
-log = logging.getLogger(__name__)
+Track = list[tuple[float, Array]]  # positions over time
+WHEN = itemgetter(0)
+
+
+class _Picture(NamedTuple):
+    """An image, which is read again when it is needed."""
+
+    camera: str
+    taken: float
+
+
+class _Segment(NamedTuple):
+    """A time in which one instruction was followed, by the policy or a person."""
+
+    instruction: str
+    person: bool
+    start: float
+    end: float
 
 
 class _Step(NamedTuple):
     """One step of an episode, without its images."""
 
-    at: float  # when its images were taken [s]
-    pictures: dict[str, int]  # camera → when its image was recorded [ns]
+    taken: float
+    arrivals: dict[str, float]  # of its images
     state: Array  # (P,) float32
 
 
-class BagDemonstrations(ImportedDemonstrations):
-    """Episodes of a bag, at the control rate of the task, with the observations that the policy node makes of it.
+class _Bag:
+    """A bag without its pixels, read once: what a policy node would have heard, and what was commanded."""
 
-    The action of a step is the motion that was commanded for one control period, whoever commanded it; where nobody
-    did, as when an arm is guided by hand, the measured one. The gripper's is its last command, or its measured opening
-    if there is none in the bag. Actions beyond the bounds of the task are clipped, depth is 0 (no return). Whether an
-    episode succeeded is not known: its outcome is "unverified". Its draws list the steps in which a person acted,
-    `expert_acts`, and their share, `recorded.corrected`.
+    def __init__(self, folder: Path, topics: Topics, limits: JointLimits) -> None:
+        self.folder, self._limits, self._joint_states = folder, limits, messages.JointStates(limits)
+        self.inputs: list[tuple[float, _Picture | Measured]] = []  # when they arrived
+        self.measured: Track = []  # joints (J,) [rad] and opening [m], together (J + 1,)
+        self.commands: Track = []  # (J,) [rad]
+        self.openings: Track = []  # commanded, 0 … 1
+        self._followed: list[tuple[int, str, bool] | None] = []  # at every joint state: instruction, person; or nothing
+        self._instruction, self._said_at, self._number = "", -np.inf, 0
+        self._used, self._dropped = set[str](), dict[str, str]()  # topics; topic → why its first message is unusable
+        with opened(folder) as reader:
+            self.kinds = {connection.topic: connection.msgtype for connection in reader.connections}
+            status = next((topic for topic in self.kinds if topic.endswith(STATUS)), None)
+            self._person = None if status else True  # who moves the arm: True, False (the policy) or nobody
+            handlers: dict[str | None, Callable[[float, Any], None]] = {
+                **{topics.joint_states: self._measure, topics.finger_states: self._measure},
+                **{topics.instruction: self._instruct, topics.commands: self._command},
+                **{topics.gripper: self._command_fingers, status: self._hand_over},
+                **{topic: partial(self._see, camera) for camera, topic in topics.images.items()},
+            }
+            self._start = reader.start_time * 1e-9
+            read, expected = 0, sum(each.msgcount for each in reader.connections if each.topic in handlers)
+            for topic, stamp, message in messages_of(reader, handlers, folder):
+                read += 1
+                try:
+                    handlers[topic]((stamp - reader.start_time) * 1e-9, message)
+                    self._used.add(topic)
+                except UserError as error:
+                    self._dropped.setdefault(topic, str(error))
+                except AttributeError:
+                    self._dropped.setdefault(topic, f"they are of type {messages.shorten(self.kinds[topic])}")
+        if read < expected:
+            raise UserError(f"{folder} is incomplete: {read} of {expected} messages are there, was its end cut off?")
+        self.require(topics.joint_states, topics.instruction)
+
+    def require(self, *topics: str) -> None:
+        """Raise a UserError unless there are usable messages on topics."""
+        for topic in topics:
+            if topic not in self.kinds:
+                known = messages.shorten(", ".join(sorted(self.kinds)) or "nothing", 500)
+                raise UserError(f"{self.folder} has no topic {topic}, it has {known}: choose others with expert.topics")
+            if topic not in self._used:
+                why = self._dropped.get(topic, "there are no messages")
+                raise UserError(f"{self.folder}: no message on {topic} can be used: {why}")
+
+    def segments(self) -> Iterator[_Segment]:
+        """Yield the times in which an instruction was followed; those of a person from motion to rest."""
+        for what, group in groupby(zip(self._followed, self.measured, strict=True), key=itemgetter(0)):
+            times, positions = zip(*(measured for _, measured in group), strict=True)
+            start, end = times[0], times[-1]
+            if what is not None and what[2]:
+                scaled = np.array(positions) / [*[STILL] * len(self._limits.joints), STILL_OPENING]
+                began, ceased = (np.flatnonzero(np.abs(scaled - scaled[at]).max(1) > 1) for at in (0, -1))
+                start = max(times[began[0]] - LEAD, start) if len(began) else end
+                end = min(times[ceased[-1]] + LEAD, end) if len(ceased) else start
+            if what is not None and end - start >= SHORTEST:
+                yield _Segment(what[1], what[2], start, end)
+
+    def _see(self, camera: str, at: float, message: Any) -> None:
+        if not hasattr(message, "format"):
+            messages.image_from(message)  # compressed ones are decoded when they are needed
+        age = age_of((message.header.stamp.sec, message.header.stamp.nanosec), self._start + at)
+        self.inputs.append((at, _Picture(camera, at - age)))
+
+    def _measure(self, at: float, message: Any) -> None:
+        if (measured := self._joint_states.read(message, at)) is None:
+            raise UserError("they hold the fingers alone")
+        self.inputs.append((at, Measured(at, *measured)))
+        self.measured.append((at, np.append(measured[0], measured[2])))
+        moved = self._instruction and self._person is not None
+        self._followed.append((self._number, self._instruction, bool(self._person)) if moved else None)
+
+    def _instruct(self, at: float, message: Any) -> None:
+        said = message.data.strip()[:LONGEST_INSTRUCTION]
+        self._number += said != self._instruction or at - self._said_at > REPEATED
+        self._instruction, self._said_at = said, at
+
+    def _hand_over(self, at: float, message: Any) -> None:
+        values = {pair.key: pair.value for pair in message.values}
+        running = False if values.get("state") == State.RUNNING else None
+        self._person = True if values.get(messages.HANDED_OVER) == "yes" else running
+
+    def _command(self, at: float, message: Any) -> None:
+        """Add a command; one without joint positions is dropped: actions follow the measured motion."""
+        if hasattr(message, "points"):  # the node replaces all points after the first by its next trajectory
+            names, positions = message.joint_names, message.points[0].positions if message.points else ()
+        elif hasattr(message, "data"):
+            names, positions = self._limits.joints, message.data
+        else:
+            names, positions = message.name, message.position
+        joints, opening = messages.command_from(names, positions, self._limits)
+        self.commands.append((at, joints))
+        if opening is not None:
+            self.openings.append((at, np.array(opening)))
+
+    def _command_fingers(self, at: float, message: Any) -> None:
+        if not len(message.data) or not np.isfinite(message.data).all():
+            raise UserError("finger positions that are not finite")
+        self.openings.append((at, np.mean(message.data) / self._limits.finger_travel))
+
+
+class BagDemonstrations(imported.ImportedDemonstrations):
+    """Episodes of bags, at the control rate of the task, with the observations that the policy node makes of them
+    (UserError: a bag is missing, damaged or incomplete, lacks topics, or is of another robot).
+
+    An episode is a time in which one instruction was followed, by the policy, or by a person to whom the arm was handed
+    over, from motion to rest; `recorded.person` in its draws tells which. Without the topic of the node's status a
+    person always moves the arm. The action of a step is the motion that was commanded for one control period; where
+    none was, as when an arm is guided by hand, the measured one. Actions beyond the bounds of the task are clipped,
+    depth is 0 (no return). Whether an episode succeeded is not known: its outcome is "unverified".
 
     Args:
-        folder: of the bag.
-        steps: "corrected": every motion of a person is an episode; "all": every try of an instruction is, with what
-            the policy did.
-        topics: in the bag.
-        status: topic of the policy node's status, which tells who moves the arm; without it, a person always does.
+        folder: of a bag, or of a folder of bags.
+        topics: in the bags.
         robot: names of the joints, and travel of the fingers.
-        image_crop: of images with another aspect ratio than the task's, crop the centre or distort the whole.
         spec: of the task.
-
-    Raises:
-        UserError: the bag is missing, damaged or incomplete, lacks topics, or is of another robot.
     """
 
-    def __init__(
-        self,
-        folder: Path | str | None,
-        steps: Literal["corrected", "all"],
-        topics: Topics,
-        status: Text,
-        robot: JointLimits,
-        image_crop: Crop,
-        *,
-        spec: Spec,
-    ) -> None:
-        self.spec, self._limits, self._crop = spec.without_truth, robot, image_crop
+    def __init__(self, folder: Path | str | None, topics: Topics, robot: JointLimits, *, spec: Spec) -> None:
+        self.spec, self._limits = spec.without_truth, robot
         model = spec.require_robot("expert=bag")
         if len(robot.joints) != len(model.joints):
             raise UserError(f"the task's robot has {len(model.joints)} joints, expert.robot has {len(robot.joints)}")
@@ -85,149 +194,124 @@ class BagDemonstrations(ImportedDemonstrations):
             raise UserError(f"no topic for the cameras {', '.join(missing)}: add +expert.topics.images.{missing[0]}")
         self._controller, self._gripper = recorded_controller(spec), gripper_index(spec)
         self._cameras = {topics.images[camera]: camera for camera in spec.cameras}  # topic → camera
-        self._index = read_index(_folder_of(folder), topics, robot, status)
-        for topic in self._cameras:
-            self._index.require(topic)
-        self._stretches = _chosen(self._index, steps)
-        self._steps = [self._steps_in(stretch) for stretch in self._stretches]
-        self._actions = [np.array([self._action(step.at) for step in taken]) for taken in self._steps]
-        self._require_bounds(np.concatenate(self._actions))
+        bags = _read_bags(folder, topics, robot)
+        for bag in bags:
+            bag.require(*self._cameras)
+        self._episodes = [(bag, segment, self._steps(bag, segment)) for bag, segment in _segments(bags)]
+        self._actions = [
+            np.array([self._action(bag, segment, step.taken) for step in steps])
+            for bag, segment, steps in self._episodes
+        ]
+        actions = np.concatenate(self._actions)
+        if wrong := imported.out_of_bounds(actions, spec, MOSTLY):
+            raise UserError(f"{folder} does not match the task: {'; '.join(wrong)}")
+        imported.log_clipped(actions, spec)
 
     @classmethod
     def recording(
-        cls,
-        folder: Path | str | None,
-        steps: str,
-        topics: Mapping[str, Any],
-        status: str,
-        robot: Mapping[str, Any],
-        image_crop: str,
-    ) -> Recording:
-        """Describe a bag: its state and action are the joints, see `ImportedDemonstrations.recording`."""
-        limits = JointLimits(**{name: value for name, value in robot.items() if name != "_target_"})
+        cls, folder: Path | str | None, topics: Mapping[str, Any], robot: Mapping[str, Any]
+    ) -> imported.Recording:
+        """Describe bags: their state and action are the joints, see `ImportedDemonstrations.recording`."""
         named = Topics(**{name: value for name, value in topics.items() if name != "_target_"})
-        index = read_index(_folder_of(folder), named, limits, status)
-        cameras = tuple(camera for camera, topic in named.images.items() if topic in index.kinds)
-        index.require(named.images[cameras[0]] if cameras else next(iter(named.images.values())))
-        track = index.commands if index.commands.times else index.measured
-        values = np.transpose(track.values)
-        bounds = {name: action_bounds(each) for name, each in zip(limits.joints, values, strict=True)}
-        taken = [each.at for _, each in index.inputs if isinstance(each, Picture) and each.camera == cameras[0]]
+        limits = JointLimits(**{name: value for name, value in robot.items() if name != "_target_"})
+        bags, joints = _read_bags(folder, named, limits), tuple(limits.joints)
+        cameras = tuple(camera for camera, topic in named.images.items() if topic in bags[0].kinds)
+        bags[0].require(named.images[cameras[0]] if cameras else next(iter(named.images.values())))
+        values = np.array([value[: len(joints)] for bag in bags for _, value in bag.commands or bag.measured]).T
+        bounds = {name: imported.action_bounds(each) for name, each in zip(joints, values, strict=True)}
+        pictures = (each for _, each in bags[0].inputs if isinstance(each, _Picture))
+        taken = [each.taken for each in pictures if each.camera == cameras[0]]
         period = float(np.median(np.diff(taken))) if len(taken) > 1 else 0.0
         rate = round(1 / period, 1) if period > 0 else 1.0
-        joints = tuple(limits.joints)
-        return Recording(cameras, rate, joints, joints, bounds, len(_chosen(index, steps)))
+        return imported.Recording(cameras, rate, joints, joints, bounds, len(_segments(bags)))
 
     def __len__(self) -> int:
         """Return the number of episodes."""
-        return len(self._stretches)
+        return len(self._episodes)
 
     def episode(self, number: int) -> Episode:
         """Return one episode, with its images; raise a UserError if they are damaged."""
-        spec, stretch, steps = self.spec, self._stretches[number], self._steps[number]
-        images = self._images(steps)
-        depth = {camera: np.zeros(spec.image_size, np.uint16) for camera in spec.depth}
-        observations = [
-            Observation(
-                {camera: images[camera, stamp] for camera, stamp in step.pictures.items()},
-                step.state,
-                stretch.instruction,
-                depth,
-            )
-            for step in steps
-        ]
-        clipped = np.clip(self._actions[number], spec.low, spec.high).astype(np.float32)
-        acts = _runs([any(start <= step.at <= end for start, end in stretch.person) for step in steps])
-        share = sum(last - first + 1 for first, last in acts) / len(steps)
-        recorded = {"episode": number, "corrected": round(share, 3), "lacks": ["depth"] if spec.depth else []}
-        draws = {"recorded": recorded, "expert_acts": acts}
-        what = (number, "recorded", stretch.instruction, "unverified", frozenset[str](), draws)
-        return Episode(*what, observations, clipped, clipped)
+        bag, segment, steps = self._episodes[number]
+        images, rows = self._images(bag, steps), {"state": np.array([step.state for step in steps])}
+        for camera in self.spec.cameras:
+            rows[f"rgb_{camera}"] = np.array([images[camera, step.arrivals[camera]] for step in steps])
+        recorded = {"episode": number, "person": segment.person, "lacks": ["depth"] if self.spec.depth else []}
+        words = segment.instruction
+        return self.recorded_episode(number, words, "unverified", recorded, rows, self._actions[number])
 
-    def _require_bounds(self, actions: Array) -> None:
-        """Log how many actions (N, D) are to be clipped; raise a UserError if they are in other units."""
-        beyond = (actions < np.array(self.spec.low) - ROUNDING) | (actions > np.array(self.spec.high) + ROUNDING)
-        if far := [name for name, share in zip(self.spec.action, beyond.mean(0), strict=True) if share > MOSTLY]:
-            raise UserError(
-                f"{self._index.folder}: most actions exceed the bounds of {', '.join(far)}: set task.low and task.high "
-                "in the units of task.units"
-            )
-        if beyond.any():
-            log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * beyond.any(1).mean())
-
-    def _steps_in(self, stretch: Stretch) -> list[_Step]:
-        """Return the steps of a stretch, made as the policy node makes its observations; a UserError without any."""
+    def _steps(self, bag: _Bag, segment: _Segment) -> list[_Step]:
+        """Return the steps of a segment, made as the policy node makes its observations; a UserError without any."""
         observer, steps, period = Observer(self.spec), list[_Step](), 1 / self.spec.control_hz
-        last = earliest = -np.inf
-        first = bisect_left(self._index.inputs, stretch.start - HISTORY, key=itemgetter(0))
-        for now, each in islice(self._index.inputs, first, None):
-            if now > stretch.end:
-                break
-            if not isinstance(each, Picture):
+        first = bisect_left(bag.inputs, segment.start - HISTORY, key=WHEN)
+        last, stop = -np.inf, bisect_right(bag.inputs, segment.end, key=WHEN)
+        for now, each in bag.inputs[first:stop]:
+            if isinstance(each, Measured):
                 observer.add_joint_state(each)
                 continue
-            observer.add_image(each.camera, np.array(each.stamp), each.at)
-            taken = observer.due(last, earliest)
-            if taken is None or observer.newest is None or not stretch.start <= taken <= stretch.end - period:
+            observer.add_image(each.camera, np.array(now), each.taken)
+            at = observer.due(last, last + period)
+            if at is None or observer.newest is None or not segment.start <= at <= segment.end - period:
                 continue
-            measured = observer.measured_at(taken)
-            if abs(measured.at - taken) <= MEASURED_WITHIN:
-                pictures = {camera: int(stamp) for camera, stamp in observer.images.items()}
-                steps.append(_Step(taken, pictures, observer.state(measured)))
-                last, earliest = taken, taken + period
+            measured = observer.measured_at(at)
+            if abs(measured.at - at) <= MEASURED_WITHIN:
+                last, arrivals = at, {camera: float(image) for camera, image in observer.images.items()}
+                steps.append(_Step(at, arrivals, observer.state(measured)))
         if not steps:
             raise UserError(
-                f"{self._index.folder} has no matching images of {', '.join(self.spec.cameras)} from "
-                f"{stretch.start:.1f} to {stretch.end:.1f} s, in '{messages.shorten(stretch.instruction)}'"
+                f"{bag.folder} has no matching images of {', '.join(self.spec.cameras)} from {segment.start:.1f} to "
+                f"{segment.end:.1f} s, in '{messages.shorten(segment.instruction)}'"
             )
         return steps
 
-    def _images(self, steps: Sequence[_Step]) -> dict[tuple[str, int], Array]:
-        """Return camera and time of recording [ns] → image (H, W, 3)."""
-        wanted = {picture for step in steps for picture in step.pictures.items()}
-        span = min(stamp for _, stamp in wanted), max(stamp for _, stamp in wanted) + 1
-        images, folder = dict[tuple[str, int], Array](), self._index.folder
-        with opened(folder) as reader:
-            connections = [connection for connection in reader.connections if connection.topic in self._cameras]
-            for topic, stamp, message in messages_of(reader, connections, folder, *span):
-                if (key := (self._cameras[topic], stamp)) in wanted:
-                    with bag_errors(folder):
-                        images[key] = resize(messages.image_from(message), self.spec.image_size, self._crop)
+    def _images(self, bag: _Bag, steps: Sequence[_Step]) -> dict[tuple[str, float], Array]:
+        """Return camera and arrival [s] → image (H, W, 3)."""
+        wanted = {place for step in steps for place in step.arrivals.items()}
+        first, last = (choose(at for _, at in wanted) for choose in (min, max))
+        images = dict[tuple[str, float], Array]()
+        with opened(bag.folder) as reader:
+            start = reader.start_time
+            span = start + round(first * 1e9), start + round(last * 1e9) + 1
+            for topic, stamp, message in messages_of(reader, self._cameras, bag.folder, *span):
+                if (place := (self._cameras[topic], (stamp - start) * 1e-9)) in wanted:
+                    with bag_errors(bag.folder):
+                        images[place] = resize(messages.image_from(message), self.spec.image_size)
         return images
 
-    def _action(self, at: float) -> Array:
+    def _action(self, bag: _Bag, segment: _Segment, at: float) -> Array:
         """Return the (D,) motion from `at` over one control period."""
-        index, end = self._index, at + 1 / self.spec.control_hz
-        track = index.commands if index.commands.covers(at) and index.commands.covers(end) else index.measured
-        motion = self._controller.motion_between(track.between(at), track.between(end))
+        end, joints = at + 1 / self.spec.control_hz, len(self._limits.joints)
+        track = bag.commands if _covers(bag.commands, at) and _covers(bag.commands, end) else bag.measured
+        motion = self._controller.motion_between(*(_between(track, when)[:joints] for when in (at, end)))
         if self._gripper is None:
             return motion
-        opening = index.gripper_commands.last(end)
-        if opening is None:
-            opening = float(index.openings.between(end)) / self._limits.stroke
-        return np.insert(motion, self._gripper, opening)
+        told = bag.openings[: bisect_right(bag.openings, end, key=WHEN)][-1:]
+        if told and told[0][0] >= segment.start:  # a command of before is the policy's, not the person's
+            return np.insert(motion, self._gripper, told[0][1])
+        return np.insert(motion, self._gripper, _between(bag.measured, end)[joints] / self._limits.stroke)
 
 
-def _folder_of(folder: Path | str | None) -> Path:
+def _covers(track: Track, at: float) -> bool:
+    """Return whether there are positions shortly before and shortly after `at`."""
+    place = bisect_right(track, at, key=WHEN)
+    return 0 < place < len(track) and track[place][0] - track[place - 1][0] <= GAP
+
+
+def _between(track: Track, at: float) -> Array:
+    """Interpolate linearly."""
+    after = min(bisect_left(track, at, key=WHEN), len(track) - 1)
+    (begin, start), (end, stop) = track[max(after - 1, 0)], track[after]
+    return start + min(max((at - begin) / max(end - begin, 1e-9), 0.0), 1.0) * (stop - start)
+
+
+def _read_bags(folder: Path | str | None, topics: Topics, limits: JointLimits) -> list[_Bag]:
     if folder is None:
         raise UserError("expert=bag needs a bag: name its folder with expert=bag expert.folder=DIR")
-    return Path(folder)
+    inside = sorted(path.parent for path in Path(folder).glob(f"*/{DESCRIPTION}"))
+    return [_Bag(each, topics, limits) for each in inside or [Path(folder)]]
 
 
-def _chosen(index: BagIndex, steps: str) -> list[Stretch]:
-    """Return the stretches that are episodes; a UserError if there are none."""
-    found = index.corrections() if steps == "corrected" else index.stretches
-    if not found and index.stretches:
-        raise UserError(
-            f"{index.folder} has no corrections: nobody moved the arm after ~/hand_over. expert.steps=all also takes "
-            "what the policy did"
-        )
-    if not found:
-        raise UserError(f"{index.folder} has no instruction that an arm followed")
-    return found
-
-
-def _runs(flags: Sequence[bool]) -> list[tuple[int, int]]:
-    """Return the first and the last step of every run of true ones."""
-    edges = np.flatnonzero(np.diff([False, *flags, False])).reshape(-1, 2)
-    return [(int(first), int(last) - 1) for first, last in edges]
+def _segments(bags: Sequence[_Bag]) -> list[tuple[_Bag, _Segment]]:
+    """Return the segments that are episodes; a UserError if there are none."""
+    if found := [(bag, segment) for bag in bags for segment in bag.segments()]:
+        return found
+    raise UserError(f"{bags[0].folder} has no instruction that an arm followed")

@@ -75,10 +75,10 @@ def _vector(key: str, value: Any) -> Array:
     """Return numbers as (N,) float32."""
     try:
         given = np.asarray(value).reshape(-1)
-    except ValueError as error:  # rows of different lengths
+        if given.dtype.kind not in "biuf":
+            raise ValueError(given.dtype)
+    except ValueError as error:  # also rows of different lengths
         raise UserError(f"{key} is not a vector of numbers") from error
-    if given.dtype.kind not in "biuf":
-        raise UserError(f"{key} is not a vector of numbers")
     with np.errstate(over="ignore"):
         vector = given.astype(np.float32)
     if not np.isfinite(vector).all():

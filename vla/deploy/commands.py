@@ -1,16 +1,11 @@
-"""What the policy node tells an arm and its gripper: one class per kind of message or action.
-
-All of them have the same few methods.
-"""
+"""What the policy node tells an arm and its gripper: messages, and goals of actions."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 from builtin_interfaces.msg import Duration
-from geometry_msgs.msg import TwistStamped, Vector3
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -20,172 +15,93 @@ from vla.deploy.control_loop import ControlLoop
 from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.lifecycle_node import GuardedLifecycleNode
 from vla.deploy.motion import Command
-from vla.deploy.ros import action_class
-from vla.deploy.settings import FrankaGripper, GripperCommand, PolicySettings
+from vla.deploy.settings import FOLLOW, PolicySettings, action_class
 
 # Time of a plan in every trajectory [s]. The next tick replaces it, and all of a long plan would take more than a tick.
 AHEAD = 0.3
 CLOSE_BELOW, OPEN_ABOVE = 0.4, 0.6  # commanded opening of a gripper at which its goal changes
-CODES = {
-    0: "SUCCESSFUL",
-    -1: "INVALID_GOAL",
-    -2: "INVALID_JOINTS",
-    -3: "OLD_HEADER_TIMESTAMP",
-    -4: "PATH_TOLERANCE_VIOLATED",
-    -5: "GOAL_TOLERANCE_VIOLATED",
-}  # of control_msgs/action/FollowJointTrajectory
-REPLACED = (0, -1)  # codes of a goal that another one has replaced
+REPLACED = (0, -1)  # error codes of FollowJointTrajectory for a goal that another one has replaced
 
 
-class Output:
-    """A receiver of commands; `senders` are those of its goals, if it is an action."""
+class ArmOutput:
+    """Publishes every command for the arm; in a dry run below ~/dry_run, where nothing obeys.
 
-    publisher: Any = None  # of what it is told, also to recordings
-    senders: Sequence[GoalSender] = ()
+    FollowJointTrajectory gets a goal whenever the plan changes, and the commands are published for recordings.
+    """
+
+    def __init__(self, node: GuardedLifecycleNode, loop: ControlLoop, settings: PolicySettings) -> None:
+        self._node, self._loop = node, loop
+        kinds = {"trajectory": (JointTrajectory, self._trajectory), "forward": (Float64MultiArray, self._positions)}
+        kind, self._message = kinds.get(settings.command, (JointState, self._joint_state))
+        topic, self.senders = settings.topics.commands, list[GoalSender]()
+        if settings.command == FOLLOW and not settings.dry_run:
+            action = action_class("control_msgs", "FollowJointTrajectory")
+            self.senders, topic = [GoalSender(node, action, topic, _trajectory_complaint)], "~/commands"
+        topic = "~/dry_run/commands" if settings.dry_run else topic
+        self.publisher = node.add_publisher(kind, topic, while_active=True)
 
     def publish(self, command: Command, now: float) -> None:
         """Pass a command of the loop on."""
-        raise NotImplementedError
-
-    def prepare(self) -> None:
-        """Begin anew; raise a UserError if an action server does not show up."""
-        for sender in self.senders:
-            sender.require_server()
-            sender.reset()
-
-
-class _ArmTopic(Output, ABC):
-    """Commands on a topic, below ~/dry_run in a dry run, where nothing obeys them."""
-
-    kind: ClassVar[Any]  # class of the messages
-
-    def __init__(
-        self, node: GuardedLifecycleNode, loop: ControlLoop, settings: PolicySettings, topic: str = ""
-    ) -> None:
-        """Args: the node; its control loop; its settings; the topic, by default that of the settings."""
-        self._node, self._loop, self._settings = node, loop, settings
-        topic = "~/dry_run/commands" if settings.dry_run else topic or settings.topics.commands
-        self.publisher = node.add_publisher(self.kind, topic, while_active=True)
-
-    def publish(self, command: Command, now: float) -> None:
-        """Publish a command."""
-        self.publisher.publish(self._message(command, now))
-
-    @abstractmethod
-    def _message(self, command: Command, now: float) -> Any:
-        """Return the message of a command."""
-
-
-class _JointStateTopic(_ArmTopic):
-    """Positions of arm and fingers, as Isaac Sim expects them."""
-
-    kind = JointState
-
-    def _message(self, command: Command, now: float) -> JointState:
-        message = joint_state(self._loop.limits, command)
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        return message
-
-
-class _TrajectoryTopic(_ArmTopic):
-    """Trajectories that end at rest, of which the next one replaces all points after the first."""
-
-    kind = JointTrajectory
-
-    def _message(self, command: Command, now: float) -> JointTrajectory:
-        return trajectory(self._loop.limits, [command, *self._loop.motion.horizon(now, AHEAD)], self._loop.tick)
-
-
-class _ForwardTopic(_ArmTopic):
-    """Plain positions of the joints."""
-
-    kind = Float64MultiArray
-
-    def _message(self, command: Command, now: float) -> Float64MultiArray:
-        return Float64MultiArray(data=command.position.tolist())
-
-
-class _TwistTopic(_ArmTopic):
-    """Velocities of the tool [m/s], [rad/s]; `twist_frame` or the base frame of the policy is theirs."""
-
-    kind = TwistStamped
-
-    def _message(self, command: Command, now: float) -> TwistStamped:
-        message = TwistStamped()
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        robot = self._loop.spec.require_robot("deployment")
-        message.header.frame_id = self._settings.twist_frame or robot.frame
-        linear, angular = self._loop.goals.tool_velocity(command).reshape(2, 3).tolist()
-        message.twist.linear, message.twist.angular = (Vector3(x=x, y=y, z=z) for x, y, z in (linear, angular))
-        return message
-
-
-class _TrajectoryGoals(_JointStateTopic):
-    """Goals of FollowJointTrajectory whenever the plan changes; what they say is also published, for recordings."""
-
-    def __init__(self, node: GuardedLifecycleNode, loop: ControlLoop, settings: PolicySettings) -> None:
-        super().__init__(node, loop, settings, "~/commands")
-        kind = action_class("control_msgs", "FollowJointTrajectory")
-        if not settings.dry_run:
-            self.senders = [GoalSender(node, kind, settings.topics.commands, trajectory_complaint, node.fail)]
-
-    def publish(self, command: Command, now: float) -> None:
-        """Send a goal if the last one is no longer valid, and publish the command."""
         for sender in self.senders:
             if (ahead := self._loop.motion.commit(command, now)) is not None:
                 sender.send(sender.kind.Goal(trajectory=trajectory(self._loop.limits, ahead, self._loop.tick)))
-        super().publish(command, now)
+        self.publisher.publish(self._message(command, now))
+
+    def _joint_state(self, command: Command, now: float) -> JointState:
+        """Positions of arm and fingers, as Isaac Sim expects them."""
+        fingers = finger_positions(self._loop.limits, command)
+        names = [*self._loop.limits.joints, *self._loop.limits.fingers[: len(fingers)]]
+        message = JointState(name=names, position=[*command.position.tolist(), *fingers])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        return message
+
+    def _trajectory(self, command: Command, now: float) -> JointTrajectory:
+        """A trajectory of which the next one replaces all points after the first."""
+        return trajectory(self._loop.limits, [command, *self._loop.motion.horizon(now, AHEAD)], self._loop.tick)
+
+    def _positions(self, command: Command, now: float) -> Float64MultiArray:
+        return Float64MultiArray(data=command.position.tolist())
 
 
-class _FingerTopic(Output):
-    """Positions of the fingers, for commands without them; in a dry run, or beside an action, a copy for recordings."""
+class GripperOutput:
+    """Publishes the positions of the fingers; in a dry run, or beside the goals of an action, as a copy for recordings.
+
+    Of an action there is one goal at a time, and another one only when the commanded state changes: open above
+    `OPEN_ABOVE`, closed below `CLOSE_BELOW`.
+    """
 
     def __init__(self, node: GuardedLifecycleNode, loop: ControlLoop, settings: PolicySettings, topic: str) -> None:
-        own = topic if settings.gripper is None else "~/gripper"
-        self._limits = loop.limits
-        topic = "~/dry_run/gripper" if settings.dry_run else own
-        self._publisher = node.add_publisher(Float64MultiArray, topic, while_active=True)
-
-    def publish(self, command: Command, now: float) -> None:
-        """Publish the positions, if the command has an opening."""
-        if fingers := finger_positions(self._limits, command):
-            self._publisher.publish(Float64MultiArray(data=fingers))
-
-
-class _GripperGoals(Output):
-    """Opens and closes a gripper: one goal at a time, and another one only when the commanded state changes."""
-
-    def __init__(
-        self, node: GuardedLifecycleNode, loop: ControlLoop, gripper: GripperCommand | FrankaGripper, server: str
-    ) -> None:
-        self._loop = loop
-        self._goals = [  # closed, open
-            (GoalSender(node, goal.kind, goal.server, goal.complaint, node.fail, self._advance), goal.message)
-            for goal in gripper.goals(server)
-        ]
+        """Args: topic of the fingers, or the action server."""
+        self._loop, gripper = loop, settings.gripper
+        goals = gripper.goals(topic) if gripper is not None and not settings.dry_run else ()
+        self._goals = [
+            (GoalSender(node, goal.kind, goal.server, goal.complaint, self._advance), goal.message) for goal in goals
+        ]  # to close, to open
         self.senders = [sender for sender, _ in self._goals]
+        copy = "~/dry_run/gripper" if settings.dry_run else "~/gripper"
+        topic = copy if settings.dry_run or goals else topic
+        self._publisher = node.add_publisher(Float64MultiArray, topic, while_active=True)
+        self.reset()
+
+    def reset(self) -> None:
+        """Send the next goal even if it repeats the last."""
         self._wanted: bool | None = None  # open?
         self._sent: bool | None = None
 
-    def prepare(self) -> None:
-        """Begin anew: the next opening is sent even if it repeats the last."""
-        super().prepare()
-        self._wanted = self._sent = None
-
     def publish(self, command: Command, now: float) -> None:
-        """Open above `OPEN_ABOVE`, close below `CLOSE_BELOW`; `opening` is 0 closed … 1 open."""
+        """Pass the opening of a command on, if it has one."""
+        if fingers := finger_positions(self._loop.limits, command):
+            self._publisher.publish(Float64MultiArray(data=fingers))
         if not self._loop.acting:
             self._wanted = None  # drops a goal that waits for the cancellation of the previous one
         elif command.opening is not None:
-            if command.opening > OPEN_ABOVE:
-                self._wanted = True
-            elif command.opening < CLOSE_BELOW:
-                self._wanted = False
+            if not CLOSE_BELOW <= command.opening <= OPEN_ABOVE:
+                self._wanted = command.opening > OPEN_ABOVE
             self._advance()
 
     def _advance(self) -> None:
         """Send the requested goal once the previous one has ended: Franka's gripper accepts one at a time."""
-        if self._wanted is None or self._wanted == self._sent:
+        if not self._goals or self._wanted is None or self._wanted == self._sent:
             return
         busy = [sender for sender in self.senders if sender.active]
         for sender in busy:
@@ -195,32 +111,6 @@ class _GripperGoals(Output):
             sender, goal = self._goals[self._wanted]
             self._sent = self._wanted
             sender.send(goal)
-
-
-COMMANDS: dict[str, type[_ArmTopic]] = {
-    "joint_state": _JointStateTopic,
-    "trajectory": _TrajectoryTopic,
-    "forward": _ForwardTopic,
-    "twist": _TwistTopic,
-    "follow_joint_trajectory": _TrajectoryGoals,
-}
-
-
-def outputs(node: GuardedLifecycleNode, loop: ControlLoop, settings: PolicySettings) -> list[Output]:
-    """Return what obeys the commands of a loop: the arm first, then the gripper."""
-    found: list[Output] = [COMMANDS[settings.command](node, loop, settings)]
-    if (topic := settings.topics.gripper) is not None:
-        found.append(_FingerTopic(node, loop, settings, topic))
-        if settings.gripper is not None and not settings.dry_run:
-            found.append(_GripperGoals(node, loop, settings.gripper, topic))
-    return found
-
-
-def joint_state(limits: JointLimits, command: Command) -> JointState:
-    """Return the target positions of arm and fingers; without an opening in the command, of the arm alone."""
-    fingers = finger_positions(limits, command)
-    names = [*limits.joints, *limits.fingers[: len(fingers)]]
-    return JointState(name=names, position=[*command.position.tolist(), *fingers])
 
 
 def finger_positions(limits: JointLimits, command: Command) -> list[float]:
@@ -243,9 +133,8 @@ def trajectory(limits: JointLimits, commands: Sequence[Command], tick: float) ->
     return JointTrajectory(joint_names=list(limits.joints), points=points)
 
 
-def trajectory_complaint(result: Any, replaced: bool) -> str:
+def _trajectory_complaint(result: Any, replaced: bool) -> str:
     """Describe a result of FollowJointTrajectory; empty if its goal was replaced and that is all."""
-    code = result.error_code
-    if replaced and code in REPLACED:
+    if replaced and result.error_code in REPLACED:
         return ""
-    return ", ".join(filter(None, (CODES.get(code, f"error code {code}"), result.error_string)))
+    return ", ".join(filter(None, (f"error code {result.error_code}", result.error_string)))

@@ -81,11 +81,6 @@ class ControlLoop:
         self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
         self._timed_out = False  # True if the loop is stopped by a time-out
 
-    def limit(self, limits: JointLimits) -> None:
-        """Replace the limits."""
-        self.limits = limits
-        self.motion.set_limits(limits)
-
     def on_image(self, camera: str, image: Array, at: float) -> None:
         """Add an image (H, W, 3) uint8 that was taken at `at`."""
         self._observer.add_image(camera, image, at)
@@ -135,11 +130,8 @@ class ControlLoop:
             self._wait_to_run("")
 
     def take_back(self, now: float) -> None:
-        """Command the arm again, from its measured pose; the gripper is left as it is until the policy moves it.
-
-        Raises:
-            UserError: the arm moves, is outside its limits, or has no recent joint state; the person keeps it.
-        """
+        """Command the arm again, from its measured pose; the gripper is left as it is until the policy moves it
+        (UserError: the arm moves, is outside its limits, or has no recent joint state; the person keeps it)."""
         measured = self._observer.newest
         if measured is None or now - measured.at > self.safety.joints_age:
             raise UserError(f"the newest joint state is older than {self.safety.joints_age} s")

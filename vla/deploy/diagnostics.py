@@ -12,14 +12,7 @@ from vla.deploy.lifecycle_node import GuardedLifecycleNode
 from vla.deploy.messages import HANDED_OVER, shorten
 from vla.deploy.safety import State
 
-LEVELS = {
-    State.WAITING: DiagnosticStatus.OK,
-    State.RUNNING: DiagnosticStatus.OK,
-    State.HANDED_OVER: DiagnosticStatus.OK,
-    State.HOLDING: DiagnosticStatus.WARN,
-    State.STOPPED: DiagnosticStatus.WARN,
-    State.FAULT: DiagnosticStatus.ERROR,
-}
+LEVELS = dict.fromkeys((State.HOLDING, State.STOPPED), DiagnosticStatus.WARN) | {State.FAULT: DiagnosticStatus.ERROR}
 MAX_MESSAGE = 300  # length of a log line or status message [characters]
 
 
@@ -57,18 +50,18 @@ class Diagnostics:
 
     def report(self) -> None:
         """Publish the status, and log a changed state."""
-        loop = self._loop
+        loop, level = self._loop, LEVELS.get(self._loop.state, DiagnosticStatus.OK)
         if (loop.state, loop.reason) != self._reported:
             self._reported, self._ignored = (loop.state, loop.reason), ""
             line = f"{loop.state}: {shorten(loop.reason, MAX_MESSAGE)}".removesuffix(": ")
             # Two calls, because rclpy refuses to log with changing severity from one line.
-            if LEVELS[loop.state] == DiagnosticStatus.OK:
+            if level == DiagnosticStatus.OK:
                 self._node.get_logger().info(line)
             else:
                 self._node.get_logger().warning(line)
         pairs = [KeyValue(key=key, value=value) for key, value in self._values().items()]
         text = shorten(self._ignored or loop.reason or loop.state.value, MAX_MESSAGE)
-        status = DiagnosticStatus(level=LEVELS[loop.state], name=self._node.get_name(), message=text, values=pairs)
+        status = DiagnosticStatus(level=level, name=self._node.get_name(), message=text, values=pairs)
         self._status.publish(status)
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()

@@ -17,8 +17,7 @@ class Inference:
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
-        self._running: Future[Array] | None = None
-        self._since = 0.0
+        self._running: Future[tuple[Array, float]] | None = None
 
     @property
     def busy(self) -> bool:
@@ -34,14 +33,14 @@ class Inference:
 
     def start(self, observation: Observation, first: bool) -> None:
         """Start an inference; `first` begins an episode."""
-        self._running, self._since = self._pool.submit(self._plan, observation, first), time.monotonic()
+        self._running = self._pool.submit(self._plan, observation, first)
 
     def take(self) -> tuple[Array, float] | None:
         """Return actions (k, D) to execute, and the duration [s], of an inference that is done, or raise its error."""
         if self._running is None or not self._running.done():
             return None
         done, self._running = self._running, None
-        return done.result(), time.monotonic() - self._since
+        return done.result()
 
     def forget(self) -> None:
         """Drop an inference under way; the next one waits for it."""
@@ -51,11 +50,13 @@ class Inference:
         """Wait for an inference under way, and end the thread."""
         self._pool.shutdown(cancel_futures=True)
 
-    def _plan(self, observation: Observation, first: bool) -> Array:
+    def _plan(self, observation: Observation, first: bool) -> tuple[Array, float]:
+        began = time.monotonic()
         if first:
             self._policy.reset(observation.instruction, 0)
         plan = self._policy.plan(observation)
         # In training the frames of a history have no gaps either.
         execute = 1 if getattr(self._policy, "history", 1) > 1 else self._policy.execute
         # What the next plan continues goes on until that is there.
-        return plan if getattr(self._policy, "chunking", None) else plan[:execute]
+        chosen = plan if getattr(self._policy, "chunking", None) else plan[:execute]
+        return chosen, time.monotonic() - began

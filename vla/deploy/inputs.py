@@ -36,12 +36,11 @@ class Inputs:
         self._node, self._loop, self._diagnostics, self._advance = node, loop, diagnostics, advance
         self._joint_states = messages.JointStates(loop.limits)
         self._stamps: dict[str, tuple[int, int]] = {}  # camera → time stamp of its last image
-        topics, reliability = settings.topics, settings.image_reliability.upper()
-        image_qos = QoSProfile(depth=1, reliability=ReliabilityPolicy[reliability])
+        topics = settings.topics
+        best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # matches every publisher
         for camera in loop.spec.cameras:
             kind = CompressedImage if topics.images[camera].endswith(COMPRESSED) else Image
-            node.add_subscription(kind, topics.images[camera], partial(self._on_image, camera), image_qos)
-        best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # matches every publisher
+            node.add_subscription(kind, topics.images[camera], partial(self._on_image, camera), best_effort)
         for topic in filter(None, {topics.joint_states, topics.finger_states}):
             node.add_subscription(JointState, topic, self._on_joint_state, best_effort)
         node.add_subscription(String, topics.instruction, self._on_instruction, QoSProfile(depth=1))

@@ -22,7 +22,8 @@ REST = 1e-9  # lower speeds are rounding errors [rad/s]
 
 @dataclass(frozen=True)
 class JointLimits:
-    """Names and limits of the joints of an arm and its gripper.
+    """Names and limits of the joints of an arm and its gripper (UserError: lists of different lengths, or a lowest
+    position that is not below the highest).
 
     Attributes:
         joints: J names, base to tip.
@@ -33,9 +34,6 @@ class JointLimits:
         margin: distance kept from the position limits [rad].
         overshoot: largest overshoot of the last goal, which lets joints pass goals without stopping [rad].
         speed_share, acceleration_share: usable share of those limits, above 0 and at most 1.
-
-    Raises:
-        UserError: lists of different lengths, or a lowest position that is not below the highest.
     """
 
     joints: Annotated[list[Text], MinLen(1)]
@@ -136,7 +134,6 @@ class JointLimiter:
     def _move(self, velocity: Array) -> Array:
         change = self.limits.max_acceleration * self._period
         velocity = np.clip(velocity, -self.limits.max_speed, self.limits.max_speed)
-        # After the speed limit, which may have been lowered in motion: the acceleration limit has priority.
         velocity = np.clip(velocity, self.velocity - change, self.velocity + change)
         # Keep the braking distance within the position limits.
         up = self._stoppable(self.limits.max_position - self.position)

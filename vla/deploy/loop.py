@@ -19,7 +19,7 @@ from vla.parallel.processes import leave_with_parent, without_triton
 from vla.rollouts.results import ERROR, Report, Result
 
 if TYPE_CHECKING:
-    from vla.deploy.demo_operator import DemoOperator
+    from vla.deploy.operator import DemoOperator
     from vla.policy import Policy
     from vla.spec import Environment
 
@@ -64,7 +64,7 @@ class Loop:
                 if result:
                     results.append(result)
                     log.info("seed %d: %s", result.seed, result.outcome)
-            log.info("%s", ", ".join(f"{key} {value}" for key, value in operator.status.items() if "[ms]" in key))
+            log.info("%s", ", ".join(f"{key} {value}" for key, value in operator.values.items() if "[ms]" in key))
         return Report(tuple(results))
 
     @contextmanager
@@ -76,25 +76,28 @@ class Loop:
             raise UserError(
                 "deploy=loop: the simulator obeys deploy.agent.command=joint_state only, without deploy.agent.dry_run"
             )
-        processes = get_context("spawn")
-        nodes = [processes.Process(target=_run, args=(node,), daemon=True) for node in (agent, simulator)]
-        for node in nodes:
-            node.start()
+        context = get_context("spawn")
+        processes = [context.Process(target=_run, args=(node,), daemon=True) for node in (agent, simulator)]
+        for process in processes:
+            process.start()
         try:
             with ros(agent.network, self.output) as stopped, ExitStack() as opened:
-                from vla.deploy.demo_operator import DemoOperator
+                from rclpy import create_node
 
-                operator = DemoOperator(agent.topics.instruction, stopped, *nodes)
-                opened.callback(operator.node.destroy_node)
+                from vla.deploy.operator import DemoOperator
+
+                node = create_node("vla_operator")
+                opened.callback(node.destroy_node)
+                operator = DemoOperator(node, agent.topics.instruction, stopped, *processes)
                 if self.record:  # to the end: an episode that fails is the one to look at
-                    opened.enter_context(closing(BagRecorder(operator.node, self.output / "bag")))
+                    opened.enter_context(closing(BagRecorder(node, self.output / "bag")))
                 yield operator
         finally:
-            for node in nodes:
-                node.terminate()
-            for node in nodes:
-                node.join(timeout=5.0)
-                node.kill()
+            for process in processes:
+                process.terminate()
+            for process in processes:
+                process.join(timeout=5.0)
+                process.kill()
 
 
 def _run(node: PolicyDeployment | SimulatorDeployment) -> None:

@@ -7,20 +7,17 @@ Shapes: H by W pixels, J joints.
 
 from __future__ import annotations
 
-import io
-import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import MaxLen
-from PIL import Image
 
 from vla.deploy.joint_limiter import JointLimits
 from vla.io.documents import STRICT, parse_json
 from vla.io.errors import UserError
+from vla.io.images import decode_image
 from vla.io.printable import printable
 from vla.io.types import Natural, NonNegative, Seed
 from vla.spec import LONGEST_INSTRUCTION, Array, Name
@@ -34,7 +31,6 @@ ENCODINGS = {
 }
 
 HANDED_OVER = "handed over"  # in the agent's status: yes if a person moves the arm, always in a dry run; no
-MOST_PIXELS = 4096 * 4096  # of a compressed image, whose header may promise any number
 LONGEST = 100_000  # characters of a message about an episode
 FINGERS_AGE = 0.5  # oldest state of fingers that come in messages of their own [s]
 BEYOND = 0.5  # its limits, where an arm that a person moved may still be [rad]
@@ -68,44 +64,25 @@ def shorten(text: str, longest: int = 80) -> str:
 
 
 def image_from(message: Any) -> Array:
-    """Read the (H, W, 3) uint8 RGB image of a sensor_msgs/Image or CompressedImage.
-
-    Raises:
-        UserError: the encoding is not supported, or the size is zero or does not match the data.
-    """
-    if hasattr(message, "format"):
-        return _decompressed(message)
+    """Read the (H, W, 3) uint8 RGB image of a sensor_msgs/Image or CompressedImage; a UserError if it is none."""
+    if hasattr(message, "format"):  # whatever it says
+        return decode_image(bytes(message.data))
     if message.encoding not in ENCODINGS:
         raise UserError(f"image encoding is {shorten(message.encoding)!r}, expected one of {', '.join(ENCODINGS)}")
     depth, order = ENCODINGS[message.encoding]
     height, width, step = message.height, message.width, message.step
-    if not height or not width:
-        raise UserError(f"image is {width} by {height} pixels")
-    if step < width * depth:
-        raise UserError(f"image step is {step} bytes, {width} pixels of {message.encoding} need {width * depth}")
-    if len(message.data) != step * height:
-        raise UserError(f"image has {len(message.data)} bytes, {height} rows of {step} are {step * height}")
+    if not height or not width or step < width * depth or len(message.data) != step * height:
+        raise UserError(
+            f"image of {width} by {height} pixels of {message.encoding} has {len(message.data)} bytes in rows of {step}"
+        )
     rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, : width * depth]
     return np.ascontiguousarray(rows.reshape(height, width, depth)[..., order])
-
-
-def _decompressed(message: Any) -> Array:
-    """Decode a sensor_msgs/CompressedImage of colours, JPEG or PNG, whatever its format field says."""
-    quoted = repr(shorten(message.format))
-    try:
-        with Image.open(io.BytesIO(message.data), formats=["JPEG", "PNG"]) as image:
-            if image.mode not in ("RGB", "RGBA") or image.width * image.height > MOST_PIXELS:
-                raise UserError(f"image of format {quoted} has {image.width} by {image.height} pixels of {image.mode}")
-            return np.array(image.convert("RGB"))
-    except (OSError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError) as error:
-        raise UserError(f"image of format {quoted} is not a JPEG or PNG, or is damaged") from error
 
 
 def fill_image(message: Any, image: Array, frame: str) -> Any:
     """Fill a sensor_msgs/Image with an (H, W, 3) uint8 RGB image; returns the message."""
     message.height, message.width = image.shape[:2]
-    message.encoding, message.step = "rgb8", 3 * image.shape[1]
-    message.header.frame_id = frame
+    message.encoding, message.step, message.header.frame_id = "rgb8", 3 * image.shape[1], frame
     message.data = image.tobytes()  # a numpy array would be checked item by item
     return message
 
@@ -118,7 +95,9 @@ class JointStates:
         self._limits, self._fingers = limits, (-np.inf, 0.0)  # when they came, opening
 
     def read(self, message: Any, at: float) -> tuple[Array, Array, float] | None:
-        """Read positions (J,) [rad], velocities (J,) [rad/s] and gripper opening [m] of a sensor_msgs/JointState.
+        """Read positions (J,) [rad], velocities (J,) [rad/s] and gripper opening [m] of a sensor_msgs/JointState
+        (UserError: a joint is missing, named twice or where the arm cannot be, the lengths differ, or a number is not
+        finite).
 
         Joints are found by name. Missing velocities, also NaN, become zero. A message with the fingers only returns
         None, and gives later ones the opening for as long as `FINGERS_AGE`.
@@ -126,10 +105,6 @@ class JointStates:
         Args:
             message: the message.
             at: when it came [s].
-
-        Raises:
-            UserError: a joint is missing or named twice, the lengths differ, a number is not finite, or a joint is
-                where the arm cannot be.
         """
         arm, fingers, names = self._limits.joints, self._limits.fingers, {*message.name}
         of_gripper = names >= {*fingers} and names.isdisjoint(arm)  # which may have further joints
@@ -152,11 +127,10 @@ class JointStates:
 def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
     """Read positions and velocities of some joints, by name."""
     names = list(message.name)
-    if len(set(names)) != len(names):
-        raise UserError("joint state names a joint twice")
-    missing = [name for name in joints if name not in names]
-    if missing:
-        raise UserError(f"joint state lacks {', '.join(missing)}; it has {', '.join(names) or 'no names'}")
+    if missing := [name for name in joints if names.count(name) != 1]:
+        raise UserError(
+            f"joint state lacks {', '.join(missing)}, or has it twice; it has {', '.join(names) or 'nothing'}"
+        )
     if len(message.position) != len(names) or len(message.velocity) not in (0, len(names)):
         raise UserError(
             f"joint state has {len(names)} names, {len(message.position)} positions, {len(message.velocity)} velocities"
@@ -171,11 +145,8 @@ def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
 
 
 def command_from(names: Sequence[str], positions: Any, limits: JointLimits) -> tuple[Array, float | None]:
-    """Read target positions (J,) [rad] and opening 0 … 1, or None without fingers, of a command, by name.
-
-    Raises:
-        UserError: a joint is missing, the lengths differ, or a number is not finite.
-    """
+    """Read target positions (J,) [rad] and opening 0 … 1, or None without fingers, of a command, by name (UserError: a
+    joint is missing, the lengths differ, or a number is not finite)."""
     names, positions = list(names), np.array(positions, dtype=float)
     missing = [name for name in limits.joints if name not in names]
     if missing or len(names) != len(positions) or not np.isfinite(positions).all():

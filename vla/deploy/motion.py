@@ -92,13 +92,11 @@ class Goals:
             self.workspace = _Workspace(controller.arm.forward, controller.low, controller.high)
 
     def of(self, actions: Array, observed: float, anchor: Array) -> list[Waypoint]:
-        """Return the goals of actions (k, D); the first one begins at the time of the observation.
+        """Return the goals of actions (k, D); the first one begins at the time of the observation (UserError: the
+        actions have another shape or are not finite).
 
         Cartesian actions are relative to the goal of the previous one, the first to the joints `anchor` (J,); joint
         positions are absolute.
-
-        Raises:
-            UserError: the actions have another shape or are not finite.
         """
         if actions.ndim != 2 or not len(actions) or actions.shape[1] != len(self._spec.action):
             raise UserError(f"the policy returned actions of the shape {actions.shape}")
@@ -113,12 +111,6 @@ class Goals:
         self._controller.reset(anchor)
         goals = [self._controller.step(action).copy() for action in actions]
         return list(zip(ends.tolist(), goals, openings, strict=True))
-
-    def tool_velocity(self, command: Command) -> Array:
-        """Return the (6,) velocity of the tool [m/s], [rad/s] in the base frame, of a command of Cartesian actions."""
-        assert isinstance(self._controller, CartesianController)
-        _, jacobian = self._controller.arm.forward(command.position)
-        return jacobian @ command.velocity
 
 
 class Motion:
@@ -159,10 +151,6 @@ class Motion:
         self.schedule, self._sent_valid = Schedule[Waypoint](self._period), False
         if plan:
             self.schedule.add(plan, plan[0][0] - self._period)
-
-    def set_limits(self, limits: JointLimits) -> None:
-        """Replace the limits."""
-        self.limiter.limits, self._sent_valid = limits, False
 
     def commanded_at(self, at: float) -> Array:
         """Return the joints (J,) that were commanded nearest to a time."""

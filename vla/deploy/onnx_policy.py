@@ -22,7 +22,7 @@ from torch.export import Dim, ExportedProgram
 from vla.io.documents import lines_of
 from vla.io.errors import UserError
 from vla.io.files import atomic_path
-from vla.io.types import Count, Text
+from vla.io.types import Text
 from vla.models.model import Batch, Model, Prediction
 from vla.policy import Policy
 from vla.spec import Spec
@@ -54,95 +54,53 @@ class Program(nn.Module):
         """Return the output."""
         rgb = {camera: inputs[camera] for camera in self.model.spec.cameras if camera in inputs}
         batch: Batch = {"rgb": rgb, **{name: value for name, value in inputs.items() if name not in rgb}}
-        if self.part == "act":
-            return self.model.predict(batch).actions
-        tokens = self.model.encode(batch)
-        assert tokens is not None
-        return tokens
-
-
-class ProgramExporter:
-    """Writes a trained policy as `act.onnx`, and `encode.onnx` if the model caches tokens of past frames.
-
-    Each program is then compared with the model on an episode of noise; `program.json` lists the inputs and the largest
-    difference. The folder is written atomically.
-
-    Args:
-        folder: output folder, which must not exist.
-    """
-
-    of_policies = True
-
-    def __init__(self, folder: Text | Path) -> None:
-        self._folder = Path(folder).resolve()
-
-    def export(self, policy: Policy) -> Path:
-        """Write the programs of a policy, in float32 for the CPU whatever its device is; returns the folder.
-
-        Raises:
-            UserError: the folder exists, ONNX is not installed, or the output of a program differs from the model's.
-        """
-        if self._folder.exists():
-            raise UserError(f"{self._folder} exists already: choose another export.folder")
-        require_onnx("choose another export")
-        policy = Policy("cpu", "fp32", compile=False, lanes=1, model=policy.model, spec=policy.spec)
-        write_programs(policy, self._folder)
-        return self._folder
+        output = self.model.predict(batch).actions if self.part == "act" else self.model.encode(batch)
+        assert output is not None
+        return output
 
 
 class OnnxPolicy(Policy):
-    """A policy on the CPU that encodes frames and predicts actions with the ONNX programs of its model.
+    """A policy on the CPU that encodes frames and predicts actions with the ONNX programs of its model (UserError: ONNX
+    is not installed, or the model cannot be exported).
 
-    The programs are exported once and kept, in a folder named by a digest of code, options and weights of the model.
-    Exact ones differ from the model by at most a thousandth of the range of an action, on an episode of noise. They
-    return no probabilities, and take one observation at a time.
-
-    Args:
-        threads: of a program; null: as many as PyTorch uses.
-        quantize: matrix products of 8-bit integers, which differ further from the model.
-        folder: of all exported programs.
-
-    Raises:
-        UserError: ONNX is not installed, or the model cannot be exported.
+    The programs are exported once and kept in `folder`, below a digest of code, options and weights of the model:
+    `act.onnx`, `encode.onnx` if the model caches tokens of past frames, and `program.json` with their inputs. They
+    differ from the model by at most a thousandth of the range of an action, on an episode of noise, return no
+    probabilities, and take one observation at a time.
     """
 
-    def __init__(self, threads: Count | None, quantize: bool, folder: Text | Path, *, model: Model, spec: Spec) -> None:
-        require_onnx("policy=default")
+    def __init__(self, folder: Text | Path, *, model: Model, spec: Spec) -> None:
+        _require_onnx()
         super().__init__("cpu", "fp32", compile=False, lanes=1, model=model, spec=spec)
-        programs = Path(folder).resolve() / f"{digest(model, spec)}{'_int8' if quantize else ''}"
+        programs = Path(folder).resolve() / digest(model, spec)
         programs.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(f"{programs}.lock"):  # several processes build the policy of an evaluation at once
             if not programs.exists():
                 log.info("exporting the model to %s", programs)
-                write_programs(self, programs, quantize)
-        act = open_onnx(programs / "act.onnx", threads)
+                write_programs(self, programs)
+        act = open_onnx(programs / "act.onnx")
         self._predict_chunk = lambda batch: Prediction(act(inputs_of(batch)))
         if (encoder := programs / "encode.onnx").exists():  # the model caches tokens of past frames
-            encode = open_onnx(encoder, threads)
+            encode = open_onnx(encoder)
             self._encode = lambda batch: encode(inputs_of(batch))
 
 
-def write_programs(policy: Policy, folder: Path, quantize: bool = False) -> None:
-    """Write the programs of a policy and `program.json` into a new folder, atomically.
-
-    Args:
-        policy: on the CPU, in float32 and not compiled.
-        folder: must not exist.
-        quantize: matrix products of 8-bit integers, which may differ as much as they like.
-
-    Raises:
-        UserError: the output of a program differs from the model's.
-    """
-    model, span = policy.model, torch.tensor(np.subtract(policy.spec.high, policy.spec.low), dtype=torch.float32)
-    report: dict[str, Any] = {"model": type(model).__name__, "spec": policy.spec.to_dict()}
+def write_programs(policy: Policy, folder: Path) -> None:
+    """Write the programs of a policy, on the CPU and not compiled, and `program.json` into a new folder, atomically
+    (UserError: the output of a program differs from the model's)."""
+    span = torch.tensor(np.subtract(policy.spec.high, policy.spec.low), dtype=torch.float32)
+    report: dict[str, Any] = {"model": type(policy.model).__name__, "spec": policy.spec.to_dict()}
     with atomic_path(folder) as draft:
         draft.mkdir(parents=True)
         for part, steps in example_inputs(policy).items():
-            program, path = Program(model, part), draft / f"{part}.onnx"
-            _write_onnx(capture(program, steps[0]), steps[0], path, quantize)
+            program, path = Program(policy.model, part), draft / f"{part}.onnx"
+            captured, names = capture(program, steps[0]), list(steps[0])
+            exact = torch.onnx.export(captured, dynamo=True, verbose=False, input_names=names, output_names=["output"])
+            assert exact is not None
+            exact.save(path)
             difference = _difference(program, open_onnx(path), steps, span if part == "act" else None)
             log.info("%s: largest difference %.1e", path.name, difference)
-            if not (quantize or difference <= TOLERANCE):  # also for NaN
+            if not difference <= TOLERANCE:  # also for NaN
                 raise UserError(
                     f"{path.name} differs from the model by {difference:.1e} of the output range: this model cannot "
                     "be exported"
@@ -187,12 +145,12 @@ def capture(program: Program, inputs: Inputs) -> ExportedProgram:
         raise UserError(f"{names} cannot be exported: {lines_of(error)[0]}") from error
 
 
-def open_onnx(path: Path, threads: int | None = None) -> Run:
+def open_onnx(path: Path) -> Run:
     """Return a function that runs an ONNX program on the CPU; raise a UserError if the file is damaged."""
     from onnxruntime import InferenceSession, SessionOptions
 
     options = SessionOptions()
-    options.intra_op_num_threads = threads or torch.get_num_threads()
+    options.intra_op_num_threads = torch.get_num_threads()
     # Else the idle threads of one program wait in a busy loop, and slow down the program that runs next.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     try:
@@ -208,26 +166,12 @@ def open_onnx(path: Path, threads: int | None = None) -> Run:
     return run
 
 
-def require_onnx(otherwise: str) -> None:
-    """Raise a UserError that names what to do `otherwise`, unless ONNX is installed."""
+def _require_onnx() -> None:
     try:
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
-        raise UserError(f"ONNX is not installed: pip install 'vla[onnx]', or {otherwise}") from error
-
-
-def _write_onnx(captured: ExportedProgram, inputs: Inputs, path: Path, quantize: bool) -> None:
-    exact = torch.onnx.export(captured, dynamo=True, verbose=False, input_names=list(inputs), output_names=["output"])
-    assert exact is not None
-    if not quantize:
-        return exact.save(path)
-    from onnxruntime.quantization import QuantType, quantize_dynamic
-
-    model = exact.model_proto
-    del model.graph.value_info[:]  # shapes of weights, which quantisation transposes
-    quantize_dynamic(model, path, weight_type=QuantType.QUInt8, op_types_to_quantize=["MatMul", "Gemm"])
-    return None
+        raise UserError("ONNX is not installed: pip install 'vla[onnx]', or choose policy=default") from error
 
 
 def _difference(program: Run, exported: Run, steps: list[Inputs], span: Tensor | None) -> float:
@@ -242,14 +186,12 @@ def digest(model: Model, spec: Spec) -> str:
     import onnxruntime
 
     content = hashlib.sha256(f"{torch.__version__} {onnxruntime.__version__} {spec.to_dict()}".encode())
-    modules = dict(model.named_modules())
-    kinds = {kind for module in modules.values() for kind in type(module).__mro__ if issubclass(kind, nn.Module)}
+    kinds = {kind for module in model.modules() for kind in type(module).__mro__ if issubclass(kind, nn.Module)}
     for file in sorted({inspect.getfile(kind) for kind in kinds}):
         content.update(Path(file).read_bytes())
-    for name, module in modules.items():
-        options = {
-            key: value for key, value in vars(module).items() if isinstance(value, bool | int | float | str | tuple)
-        }
+    for name, module in model.named_modules():
+        plain = (bool, int, float, str, tuple)
+        options = {key: value for key, value in vars(module).items() if isinstance(value, plain)}
         content.update(repr((name, type(module).__qualname__, options)).encode())
     for values in chain(model.parameters(), model.buffers()):
         content.update(values.detach().contiguous().numpy().tobytes())

@@ -4,32 +4,25 @@ from __future__ import annotations
 
 import time
 import traceback
-from dataclasses import replace
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleState
-from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
-from vla.deploy.commands import outputs
+from vla.deploy.commands import ArmOutput, GripperOutput
 from vla.deploy.control_loop import ControlLoop
 from vla.deploy.diagnostics import Diagnostics
 from vla.deploy.inference import Inference
 from vla.deploy.inputs import Inputs
-from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.lifecycle_node import GuardedLifecycleNode, transition
 from vla.deploy.safety import State
 from vla.deploy.settings import PolicySettings
 from vla.io.errors import UserError
 from vla.policy import Policy
-from vla.robots.controllers import acts_on_joints
 
-SHARES = ("speed_share", "acceleration_share")  # the parameters
 DELIVERED = Duration(seconds=1.0)  # longest wait for the last commands to arrive
 
 
@@ -42,34 +35,6 @@ class PolicyNode(GuardedLifecycleNode):
         self.loop: ControlLoop | None = None  # while configured
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # runs even if simulated time is paused
         self._timers: list[Any] = []  # while active
-        span = FloatingPointRange(from_value=0.01, to_value=1.0)
-        try:
-            for share in SHARES:
-                value = float(getattr(settings.robot, share))  # YAML may hold whole numbers
-                self.declare_parameter(share, value, ParameterDescriptor(floating_point_range=[span]))
-        except ParameterException as error:  # in the arguments after --ros-args
-            raise UserError(str(error)) from error
-        self.add_on_set_parameters_callback(self._require_changeable)
-        self.add_post_set_parameters_callback(self._apply_shares)
-
-    def _require_changeable(self, parameters: list[Parameter]) -> SetParametersResult:
-        """While active, allow only a smaller share of the speed."""
-        for parameter in (each for each in parameters if self.active and each.name in SHARES):
-            raised = parameter.value > self.get_parameter(parameter.name).value
-            # With less acceleration the arm could not brake before its limits.
-            if raised or parameter.name == "acceleration_share":
-                return SetParametersResult(successful=False, reason=f"deactivate before changing {parameter.name}")
-        return SetParametersResult(successful=True)
-
-    def _apply_shares(self, parameters: list[Parameter]) -> None:
-        """Apply changes that were accepted."""
-        if self.loop is not None:
-            self.loop.limit(self._limits)
-
-    @property
-    def _limits(self) -> JointLimits:
-        """The limits with the parameters as they are now."""
-        return replace(self.settings.robot, **{share: self.get_parameter(share).value for share in SHARES})
 
     @property
     def active(self) -> bool:
@@ -79,27 +44,24 @@ class PolicyNode(GuardedLifecycleNode):
     @transition
     def on_configure(self, state: LifecycleState) -> None:
         """Check that policy, robot and topics match, warm the policy up, connect."""
-        settings, topics = self.settings, self.settings.topics
-        if unnamed := sorted(set(self.policy.spec.cameras) - set(topics.images)):
+        settings, topics, spec = self.settings, self.settings.topics, self.policy.spec
+        if unnamed := sorted(set(spec.cameras) - set(topics.images)):
             missing = ", ".join(unnamed)
             raise UserError(f"no topic for the policy's cameras {missing}: add +deploy.topics.images.{unnamed[0]}")
-        twist = settings.command == "twist"
-        if twist and acts_on_joints(self.policy.spec):
-            raise UserError("command=twist needs a policy of Cartesian actions, this one's are joint positions")
-        follows_positions = not (settings.dry_run or twist)
-        policy, limits = self.policy, self._limits
-        execute = policy.execute if getattr(policy, "chunking", None) else None
-        loop = ControlLoop(policy.spec, limits, settings.safety, settings.command_hz, follows_positions, execute)
-        if settings.gripper is not None and not loop.goals.has_gripper:
-            raise UserError("deploy/gripper needs a policy that moves a gripper")
-        if settings.gripper is not None and topics.gripper is None:
-            raise UserError("deploy/gripper needs its action server in deploy.topics.gripper")
+        execute = self.policy.execute if getattr(self.policy, "chunking", None) else None
+        follows = not settings.dry_run
+        loop = ControlLoop(spec, settings.robot, settings.safety, settings.command_hz, follows, execute)
+        if settings.gripper is not None and not (loop.goals.has_gripper and topics.gripper):
+            raise UserError(
+                "deploy/gripper needs a policy that moves a gripper, and its action server in deploy.topics.gripper"
+            )
         self._inference = Inference(self.policy)
         self._inference.warm_up()
         self.diagnostics = Diagnostics(self, loop, settings.dry_run)
         Inputs(self, loop, settings, self.diagnostics, self._advance)
-        self._outputs = outputs(self, loop, settings)
-        self._commands = self._outputs[0].publisher
+        self._arm = ArmOutput(self, loop, settings)
+        self._gripper = GripperOutput(self, loop, settings, topics.gripper) if topics.gripper else None
+        self._senders = [*self._arm.senders, *(self._gripper.senders if self._gripper else ())]
         self.add_service(Trigger, "~/stop", self._on_stop)
         self.add_service(Trigger, "~/resume", self._on_resume)
         self.add_service(SetBool, "~/hand_over", self._on_hand_over)
@@ -121,11 +83,13 @@ class PolicyNode(GuardedLifecycleNode):
 
     def _require_command(self) -> None:
         """Raise a UserError if another node commands the arm, or an action server is not there."""
-        others = self.count_publishers(self._commands.topic_name) - 1
-        if others > 0:
-            raise UserError(f"{others} other publisher(s) on {self._commands.topic_name}: stop them first")
-        for output in self._outputs:
-            output.prepare()
+        topic = self._arm.publisher.topic_name
+        if (others := self.count_publishers(topic) - 1) > 0:
+            raise UserError(f"{others} other publisher(s) on {topic}: stop them first")
+        for sender in self._senders:
+            sender.prepare()
+        if self._gripper:
+            self._gripper.reset()
 
     @transition
     def on_deactivate(self, state: LifecycleState) -> None:
@@ -165,10 +129,9 @@ class PolicyNode(GuardedLifecycleNode):
             if loop.motion.limiter.resting:
                 break
             time.sleep(loop.tick)
-        self._commands.wait_for_all_acked(DELIVERED)  # the last ones must arrive, even if the node then ends
-        senders = [sender for output in self._outputs for sender in output.senders]
-        time.sleep(2 * loop.tick if senders else 0.0)  # a server is a little behind
-        for sender in senders:
+        self._arm.publisher.wait_for_all_acked(DELIVERED)  # the last ones must arrive, even if the node then ends
+        time.sleep(2 * loop.tick if self._senders else 0.0)  # a server is a little behind
+        for sender in self._senders:
             sender.cancel()
 
     def fail(self, reason: str) -> None:
@@ -213,9 +176,8 @@ class PolicyNode(GuardedLifecycleNode):
             self.diagnostics.record("tick", now - self._last_tick)
         self._last_tick = now
         assert self.loop is not None
-        for output in () if self.loop.handed_over else self._outputs:
-            for sender in output.senders:
-                sender.check()
+        for sender in () if self.loop.handed_over else self._senders:
+            sender.check()
         self._advance()
         self._send(self.loop)
 
@@ -241,14 +203,15 @@ class PolicyNode(GuardedLifecycleNode):
         """Pass this tick's command on."""
         now = time.monotonic()
         if (command := loop.command(now)) is not None:
-            for output in self._outputs:
-                output.publish(command, now)
+            self._arm.publish(command, now)
+            if self._gripper:
+                self._gripper.publish(command, now)
         self.diagnostics.report_changes()
 
     def _check_publishers(self) -> None:
         """Fault if another node commands the arm, hold if a camera topic has several publishers; report."""
         assert self.loop is not None
-        commands = self._commands.topic_name
+        commands = self._arm.publisher.topic_name
         if self.count_publishers(commands) > 1 and not self.loop.handed_over:
             self.loop.fail(f"another node commands the arm on {commands}")
         for camera in self.policy.spec.cameras:

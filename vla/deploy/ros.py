@@ -10,7 +10,7 @@ import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib import import_module
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 from types import FrameType
@@ -46,19 +46,13 @@ NETWORKS: dict[str, tuple[Range, str | None]] = {  # discovery range and profile
 }
 
 
+@dataclass(frozen=True)
 class RosNetwork:
     """The part of the network that ROS communicates with."""
 
-    def __init__(
-        self, discovery: Range, profile: str | None, domain: Annotated[int, Ge(0), Le(MAX_DOMAIN)] | None
-    ) -> None:
-        """Args:
-        discovery: ROS_AUTOMATIC_DISCOVERY_RANGE.
-        profile: file with a Fast DDS profile; "loopback" is that of this package, for 127.0.0.1 only.
-        domain: ROS_DOMAIN_ID; None: that of the environment.
-        """
-        self.discovery, self.domain = discovery, domain
-        self.profile = str(LOOPBACK) if profile == "loopback" else profile
+    discovery: Range  # ROS_AUTOMATIC_DISCOVERY_RANGE
+    profile: str | None  # file with a Fast DDS profile; "loopback" is that of this package, for 127.0.0.1 only
+    domain: Annotated[int, Ge(0), Le(MAX_DOMAIN)] | None  # ROS_DOMAIN_ID; None: that of the environment
 
     @classmethod
     def named(cls, name: str) -> RosNetwork:
@@ -69,15 +63,16 @@ class RosNetwork:
         """Set the environment variables that ROS reads at start; raise a UserError if ROS would not accept them."""
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = self.discovery
         if self.profile is not None:
-            if not Path(self.profile).is_file():
-                raise UserError(f"deploy.network.profile: there is no file {self.profile}")
+            profile = LOOPBACK if self.profile == "loopback" else Path(self.profile)
+            if not profile.is_file():
+                raise UserError(f"deploy.network.profile: there is no file {profile}")
             middleware = os.environ.get("RMW_IMPLEMENTATION") or FAST_DDS
             if not middleware.startswith(FAST_DDS):
                 raise UserError(
                     f"RMW_IMPLEMENTATION is {middleware}, which ignores the profile of Fast DDS that keeps others out: "
                     "unset it, or choose deploy/network=localhost or site"
                 )
-            os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = self.profile
+            os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(profile)
         if self.domain is not None:
             os.environ["ROS_DOMAIN_ID"] = str(self.domain)
 
@@ -123,18 +118,6 @@ def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
         rclpy.try_shutdown()
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def action_class(package: str, name: str) -> Any:
-    """Return the class of an action; raise a UserError if its package is not installed."""
-    try:
-        return getattr(import_module(f"{package}.action"), name)
-    except (ImportError, AttributeError) as error:
-        apt = f"apt install ros-jazzy-{package.replace('_', '-')}"
-        source = "build franka_ros2" if package == "franka_msgs" else apt
-        raise UserError(
-            f"{package}/action/{name} is not installed: {source}, and source its setup.bash before the start ({error})"
-        ) from error
 
 
 @contextmanager

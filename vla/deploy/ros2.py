@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from vla.deploy.joint_limiter import JointLimits
-from vla.deploy.ros import RosNetwork, action_class, ros, spin
-from vla.deploy.settings import PolicySettings, Topics
+from vla.deploy.ros import RosNetwork, ros, spin
+from vla.deploy.settings import FOLLOW, PolicySettings, SimulatorSettings, action_class
 from vla.io.errors import UserError
-from vla.io.types import Positive, Seed
 
 if TYPE_CHECKING:
     from vla.policy import Policy
@@ -49,7 +47,7 @@ class PolicyDeployment(PolicySettings, _RosDeployment):
 
     def run(self) -> None:
         """Run until interrupted, then brake and hold; raise a UserError if policy, robot and messages do not fit."""
-        if self.command == "follow_joint_trajectory":
+        if self.command == FOLLOW:
             action_class("control_msgs", "FollowJointTrajectory")
         if self.gripper is not None:
             self.gripper.goals("gripper")
@@ -70,27 +68,11 @@ class PolicyDeployment(PolicySettings, _RosDeployment):
 
 
 @dataclass(kw_only=True)
-class SimulatorDeployment(_RosDeployment):
-    """The simulated arm of a task as a node with the topics of a real one.
-
-    Attributes:
-        robot: names of the joints of the arm.
-        topics: names of the topics.
-        joints_hz: rate of joint states and of the execution of commands.
-        camera_hz: rate of images.
-        command_timeout: the arm holds after so long without a command [s].
-        seed: seed of the first episode.
-    """
+class SimulatorDeployment(SimulatorSettings, _RosDeployment):
+    """The simulated arm of a task as a node with the topics of a real one."""
 
     needs_policy: ClassVar[bool] = False
     needs_environment: ClassVar[bool] = True
-
-    robot: JointLimits
-    topics: Topics
-    joints_hz: Positive
-    camera_hz: Positive
-    command_timeout: Positive
-    seed: Seed
 
     def run(self) -> None:
         """Play episodes until interrupted."""
@@ -98,8 +80,7 @@ class SimulatorDeployment(_RosDeployment):
         with ros(self.network, self.output) as stopped:
             from vla.deploy.simulator_node import SimulatorNode
 
-            rates = self.joints_hz, self.camera_hz
-            node = SimulatorNode(environment, self.robot, self.topics, rates, self.command_timeout, self.seed)
+            node = SimulatorNode(environment, self)
             try:
                 spin(node, stopped)
             finally:

@@ -1,11 +1,9 @@
-"""A policy server that speaks openpi's protocol, for any client that does.
+"""A policy server that speaks openpi's protocol (openpi, src/openpi/serving/websocket_policy_server.py).
 
-Over a WebSocket without compression the server first sends its metadata, then one map with `actions` (k, D) for every
-observation of the client, all in the encoding of `vla.io.array_messages`. An error is sent as text and closes the
-connection. `GET /healthz` answers OK (openpi, src/openpi/serving/websocket_policy_server.py).
-
-Beyond that protocol, the metadata describe actions, state and images, and the message {"reset": True, "prompt": …,
-"seed": …} starts an episode: it clears the history of the connection and seeds the noise of the model.
+Over a WebSocket without compression it first sends its metadata, then one map with `actions` (k, D) for every
+observation, all in the encoding of `vla.io.array_messages`. An error is sent as text and closes the connection.
+`GET /healthz` answers OK. Beyond that protocol, the message {"reset": True, "prompt": …, "seed": …} starts an episode:
+it clears the history of the connection and seeds the noise of the model.
 """
 
 from __future__ import annotations
@@ -24,6 +22,7 @@ from http import HTTPStatus
 from ipaddress import ip_address
 from itertools import count
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -51,7 +50,7 @@ Port = Annotated[int, Ge(0), Le(65535)]  # 0: any free one
 
 @dataclass(kw_only=True)
 class PolicyServer:
-    """The policy behind openpi's protocol.
+    """The policy behind openpi's protocol (UserError: other machines could connect without a key).
 
     Attributes:
         host, port: address to listen at.
@@ -62,9 +61,6 @@ class PolicyServer:
         origins: of web pages that may use the policy, such as http://localhost:3000.
         policy, environment: factories of the policy and of the task's environment.
         output: folder of results, unused.
-
-    Raises:
-        UserError: other machines could connect without a key.
     """
 
     host: Text
@@ -94,11 +90,18 @@ class PolicyServer:
             )
         if keyless := [camera for camera in policy.spec.cameras if camera not in self.keys.images]:
             raise UserError(f"the policy sees {', '.join(keyless)}: add +deploy.keys.images.{keyless[0]}=KEY")
+        stop = Event()
+        before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            asyncio.run(Service(self, policy).serve())
+            with Service(self, policy).in_thread() as url:
+                log.info("serving the policy at %s", url)
+                stop.wait()
         except OSError as error:
             where = f"deploy.host={self.host} deploy.port={self.port}"
             raise UserError(f"cannot listen at {where}: {error.strerror}; deploy.port=0 is any free one") from error
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 class Service:
@@ -108,15 +111,6 @@ class Service:
         self._settings, self._policy = settings, policy
         self._waiting: asyncio.Queue[tuple[int, Observation, asyncio.Future[Array]]] = asyncio.Queue()
         self._lanes = set[int]()  # of the policy, one for each connection
-
-    async def serve(self) -> None:
-        """Serve until SIGINT or SIGTERM."""
-        stop, loop = asyncio.Event(), asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, stop.set)
-        async with self._listening() as url:
-            log.info("serving the policy at %s", url)
-            await stop.wait()
 
     @contextmanager
     def in_thread(self) -> Iterator[str]:
@@ -142,11 +136,9 @@ class Service:
     async def _listening(self) -> AsyncIterator[str]:
         """Serve within the context, which is entered with the URL once the first client can be answered."""
         settings, policy = self._settings, self._policy
-        options: dict[str, Any] = {
-            **{"compression": None, "max_size": settings.largest_message, "max_queue": 1},
-            **{"origins": [None, *settings.origins], "process_request": self._answer_request},  # programs send none
-            **{"open_timeout": PATIENCE, "close_timeout": PATIENCE},
-        }
+        options: dict[str, Any] = {"compression": None, "max_size": settings.largest_message, "max_queue": 1}
+        options |= {"origins": [None, *settings.origins], "process_request": self._answer_request}  # programs have none
+        options |= {"open_timeout": PATIENCE, "close_timeout": PATIENCE}
         with ThreadPoolExecutor(1, "inference") as thread:
             # The first pass through a compiled model takes up to a minute.
             noise = policy.spec.random_observation(np.random.default_rng(0))
@@ -162,8 +154,9 @@ class Service:
         if request.path == "/healthz":
             return connection.respond(HTTPStatus.OK, "OK\n")
         key, given = self._settings.api_key, "".join(request.headers.get_all("Authorization"))
-        wanted = f"Api-Key {key}".encode()
-        if key is not None and not hmac.compare_digest(given.encode(errors="surrogateescape"), wanted):
+        if key is not None and not hmac.compare_digest(
+            given.encode(errors="surrogateescape"), f"Api-Key {key}".encode()
+        ):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "send the API key as Authorization: Api-Key …\n")
         if len(self._lanes) >= self._settings.connections:
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{len(self._lanes)} clients are connected\n")
@@ -235,7 +228,6 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
     `delay`, will be over when the answer arrives.
     """
     spec = policy.spec
-    action = {"names": list(spec.action), "units": list(spec.units)}
     bounds = {"low": np.array(spec.low, np.float32), "high": np.array(spec.high, np.float32)}
     return {
         "server": "vla",
@@ -243,7 +235,7 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
         "images": {keys.images[camera]: [*spec.image_size, 3] for camera in spec.cameras},
         "state": {"keys": keys.state, "names": list(spec.state), "units": list(spec.state_units)},
         "prompt": keys.prompt,
-        "action": {**action, **bounds},
+        "action": {"names": list(spec.action), "units": list(spec.units), **bounds},
         "control_hz": spec.control_hz,
         "horizon": policy.model.chunk,
         "execute": policy.execute,

@@ -1,29 +1,26 @@
-"""Settings of the nodes. No module of ROS is imported here."""
+"""Settings of the nodes. No module of ROS is imported here until a goal is made."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from typing import Any, Literal, NamedTuple
 
 from vla.deploy.joint_limiter import JointLimits
-from vla.deploy.ros import action_class
 from vla.deploy.safety import Safety
 from vla.io.errors import UserError
-from vla.io.types import NonNegative, Positive, Text
+from vla.io.types import NonNegative, Positive, Seed
 
 COMPRESSED = "/compressed"  # end of the topics of sensor_msgs/CompressedImage, as of image_transport
 NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # of a topic
+FOLLOW = "follow_joint_trajectory"  # the command that is an action
 
 
 @dataclass(frozen=True)
 class Topics:
-    """Names of the topics, before remapping.
-
-    Raises:
-        UserError: a name is not valid in ROS.
-    """
+    """Names of the topics, before remapping (UserError: a name is not valid in ROS)."""
 
     images: dict[str, str]  # camera → topic of sensor_msgs/Image, or of CompressedImage if it ends with /compressed
     joint_states: str  # sensor_msgs/JointState
@@ -39,7 +36,7 @@ class Topics:
                 raise UserError(f"topics.{key} is {topic!r}, expected letters, digits and _ between slashes")
 
 
-class _Goal(NamedTuple):
+class Goal(NamedTuple):
     """A goal of an action."""
 
     kind: Any  # class of the action
@@ -56,7 +53,7 @@ class GripperCommand:
     closed: float
     effort: Positive  # largest [N] or [Nm]
 
-    def goals(self, server: str) -> tuple[_Goal, _Goal]:
+    def goals(self, server: str) -> tuple[Goal, Goal]:
         """Return the goals that close and open it; raise a UserError if the messages are not installed."""
         kind = action_class("control_msgs", "GripperCommand")
         closing, opening = kind.Goal(), kind.Goal()
@@ -67,7 +64,7 @@ class GripperCommand:
             # A stalled gripper has grasped something, which is no error.
             return "" if result.stalled else "it does not reach its position"
 
-        return _Goal(kind, server, closing, complaint), _Goal(kind, server, opening, complaint)
+        return Goal(kind, server, closing, complaint), Goal(kind, server, opening, complaint)
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,7 @@ class FrankaGripper:
     speed: Positive  # [m/s]
     force: Positive  # [N]
 
-    def goals(self, server: str) -> tuple[_Goal, _Goal]:
+    def goals(self, server: str) -> tuple[Goal, Goal]:
         """Return the goals that close and open it; raise a UserError if the messages are not installed."""
         grasp, move = (action_class("franka_msgs", name) for name in ("Grasp", "Move"))
         speed, force = float(self.speed), float(self.force)  # YAML may hold whole numbers
@@ -89,9 +86,21 @@ class FrankaGripper:
         closing.epsilon.inner, closing.epsilon.outer = map(float, self.epsilon)
         return (
             # A missed grasp has an empty error text, so only errors of the driver count.
-            _Goal(grasp, f"{server}/grasp", closing, lambda result, _: result.error),
-            _Goal(move, f"{server}/move", opening, lambda result, _: result.error or "it does not reach its width"),
+            Goal(grasp, f"{server}/grasp", closing, lambda result, _: result.error),
+            Goal(move, f"{server}/move", opening, lambda result, _: result.error or "it does not reach its width"),
         )
+
+
+def action_class(package: str, name: str) -> Any:
+    """Return the class of an action; raise a UserError if its package is not installed."""
+    try:
+        return getattr(import_module(f"{package}.action"), name)
+    except (ImportError, AttributeError) as error:
+        apt = f"apt install ros-jazzy-{package.replace('_', '-')}"
+        source = "build franka_ros2" if package == "franka_msgs" else apt
+        raise UserError(
+            f"{package}/action/{name} is not installed: {source}, and source its setup.bash before the start ({error})"
+        ) from error
 
 
 @dataclass(kw_only=True)
@@ -101,22 +110,39 @@ class PolicySettings:
     Attributes:
         robot: the joints of the arm and their limits.
         topics: names of the topics.
-        safety: time-outs and limits.
-        command: JointState with positions, JointTrajectory that ends at rest, Float64MultiArray of positions,
-            TwistStamped of the tool, for Cartesian actions, or goals of the action FollowJointTrajectory.
-        twist_frame: base frame of a TwistStamped; None: as the policy names it.
+        command: JointState with positions, JointTrajectory that ends at rest, Float64MultiArray of positions, or goals
+            of the action FollowJointTrajectory.
         gripper: action of the gripper; None: it takes positions on a topic.
         command_hz: commands per second.
-        image_reliability: QoS of the images; "reliable" helps with large images on a lossy network.
         dry_run: publish the commands below ~/dry_run, where nothing obeys them.
+        safety: time-outs and limits.
     """
 
     robot: JointLimits
     topics: Topics
-    safety: Safety
-    command: Literal["joint_state", "trajectory", "forward", "twist", "follow_joint_trajectory"]
-    twist_frame: Text | None
+    command: Literal["joint_state", "trajectory", "forward", "follow_joint_trajectory"]
     gripper: GripperCommand | FrankaGripper | None
     command_hz: Positive
-    image_reliability: Literal["best_effort", "reliable"]
     dry_run: bool
+    safety: Safety
+
+
+@dataclass(kw_only=True)
+class SimulatorSettings:
+    """Settings of the simulator node.
+
+    Attributes:
+        robot: names of the joints of the arm.
+        topics: names of the topics.
+        joints_hz: rate of joint states and of the execution of commands.
+        camera_hz: rate of images.
+        command_timeout: the arm holds after so long without a command [s].
+        seed: seed of the first episode.
+    """
+
+    robot: JointLimits
+    topics: Topics
+    joints_hz: Positive
+    camera_hz: Positive
+    command_timeout: Positive
+    seed: Seed

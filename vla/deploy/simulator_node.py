@@ -16,9 +16,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from vla.deploy import messages
-from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.messages import SimulatedEpisode
-from vla.deploy.settings import Topics
+from vla.deploy.settings import SimulatorSettings
 from vla.io.errors import UserError
 from vla.spec import LONGEST_INSTRUCTION, Array, Environment, TakesJointTargets
 
@@ -29,22 +28,14 @@ class SimulatorNode(Node):
     The time of an episode starts with the first instruction, as in evaluation.
     """
 
-    def __init__(
-        self,
-        environment: Environment,
-        limits: JointLimits,
-        topics: Topics,
-        rates: tuple[float, float],
-        command_timeout: float,
-        seed: int,
-    ) -> None:
-        """Args: an environment that `TakesJointTargets`; its arm; topics; rates of joints and cameras [Hz]; time-out of
-        commands [s]; seed of the first episode.
+    def __init__(self, environment: Environment, settings: SimulatorSettings) -> None:
+        """Args: an environment that `TakesJointTargets`; the settings.
 
         Raises:
             UserError: the environment has no robot, is not `TakesJointTargets`, or gives several instructions in a
                 row, or a control step is not a whole number of ticks.
         """
+        rates, topics, limits = (settings.joints_hz, settings.camera_hz), settings.topics, settings.robot
         self._model = environment.spec.require_robot("deploy=simulator")
         if not isinstance(environment, TakesJointTargets):
             raise UserError(
@@ -57,8 +48,8 @@ class SimulatorNode(Node):
                 f"the simulator's joints_hz={rates[0]:g} must be a multiple of the task's {control_hz:g} Hz"
             )
         super().__init__("vla_simulator")
-        self.environment, self._drivable, self._limits, self.seed = environment, environment, limits, seed - 1
-        self._period, self._frame_period, self._command_timeout = 1 / rates[0], 1 / rates[1], command_timeout
+        self.environment, self._drivable, self._limits, self.seed = environment, environment, limits, settings.seed - 1
+        self._period, self._frame_period, self._command_timeout = 1 / rates[0], 1 / rates[1], settings.command_timeout
         qos = QoSProfile(depth=1)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._images = {
@@ -155,8 +146,8 @@ class SimulatorNode(Node):
         return joints, velocities, float(state[spec.indices([model.gripper])[0]]) if model.gripper else 0.0
 
     def _publish_episode(self) -> None:
-        environment = self.environment
+        world = self.environment
         steps, seconds = self._ticks // self._ticks_per_step, self._ticks * self._period
-        ended = (environment.done, steps, seconds, environment.outcome, environment.task)
-        episode = SimulatedEpisode(self.seed, self.instruction, *ended, tuple(sorted(environment.milestones)))
+        ended = (world.done, steps, seconds, world.outcome, world.task, tuple(sorted(world.milestones)))
+        episode = SimulatedEpisode(self.seed, self.instruction, *ended)
         self._episode.publish(String(data=json.dumps(asdict(episode))))

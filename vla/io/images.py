@@ -1,50 +1,79 @@
-"""Resizing of camera images to the size that a policy was trained with.
+"""Images of cameras: files that anybody may have written, and one rule of resizing for policies and importers.
 
-Shapes: H by W pixels.
+Shapes: N images, H by W pixels.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+import io
+import struct
+import zlib
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
+
+from vla.io.errors import UserError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Array = np.ndarray
 
-Crop = Literal["centre", "none"]
+FORMATS = ("PNG", "JPEG", "WEBP")
+MODES = ("RGB", "RGBA", "L", "LA", "P")  # of Pillow, with 8 bits per channel
+MOST_PIXELS = 4096 * 4096  # of a file, whose header may promise any number
+
+Fit = Literal["crop", "pad", "stretch"]  # for another aspect ratio: the centre, black borders, or distorted
 
 
-def resize(image: Array, size: tuple[int, int], crop: Crop) -> Array:
-    """Resize an (H, W, 3) uint8 image to `size` (height, width); an image of that size is returned as is.
+def fitted(images: Tensor, size: tuple[int, int], fit: Fit) -> Tensor:
+    """Resize (N, H, W, 3) uint8 images to `size` (height, width), bilinear and antialiased, on their device."""
+    import torch.nn.functional as F  # takes seconds
 
-    "centre" first crops to the largest centred part with the aspect ratio of `size`; "none" distorts the whole image.
-    The interpolation is bilinear and antialiased.
-    """
-    if image.shape[:2] == size:
-        return image
-    rows, columns = _crop_region(image.shape, size, crop)
-    cropped = Image.fromarray(image[rows, columns])
-    # Reduce very large images by an integer factor first, which is faster and hardly differs.
-    return np.array(cropped.resize((size[1], size[0]), Image.Resampling.BILINEAR, reducing_gap=3.0))
-
-
-def describe_resize(shape: tuple[int, ...], size: tuple[int, int], crop: Crop) -> str:
-    """Describe what `resize` does to images (H, W, …); empty if they have that size already."""
-    if shape[:2] == size:
-        return ""
-    rows, columns = _crop_region(shape, size, crop)
-    height, width = rows.stop - rows.start, columns.stop - columns.start
-    crop_text = f"cropped at the centre to {width} by {height} and " if (height, width) != shape[:2] else ""
-    return f"images of {shape[1]} by {shape[0]} pixels are {crop_text}resized to {size[1]} by {size[0]}"
-
-
-def _crop_region(shape: tuple[int, ...], size: tuple[int, int], crop: Crop) -> tuple[slice, slice]:
-    """Rows and columns of an image (H, W, …) that are kept."""
-    height, width = shape[:2]
-    if crop == "none":
-        return slice(0, height), slice(0, width)
-    scale = min(height / size[0], width / size[1])
-    rows, columns = max(round(scale * size[0]), 1), max(round(scale * size[1]), 1)
+    (height, width), shape = size, images.shape[1:3]
+    x = images.permute(0, 3, 1, 2)
+    rows, columns = height, width  # of the result that show the images
+    if fit == "crop":
+        scale = min(shape[0] / height, shape[1] / width)
+        kept = max(round(scale * height), 1), max(round(scale * width), 1)
+        top, left = ((whole - part) // 2 for whole, part in zip(shape, kept, strict=True))
+        x = x[:, :, top : top + kept[0], left : left + kept[1]]
+    elif fit == "pad":
+        scale = min(height / shape[0], width / shape[1])
+        rows, columns = max(round(scale * shape[0]), 1), max(round(scale * shape[1]), 1)
+    if images.is_cuda:  # where torch interpolates no integers
+        x = F.interpolate(x.float(), (rows, columns), mode="bilinear", antialias=True).round_().clamp_(0, 255)
+    else:
+        x = F.interpolate(x, (rows, columns), mode="bilinear", antialias=True)
     top, left = (height - rows) // 2, (width - columns) // 2
-    return slice(top, top + rows), slice(left, left + columns)
+    x = F.pad(x, (left, width - columns - left, top, height - rows - top))
+    return x.to(images.dtype).permute(0, 2, 3, 1).contiguous()
+
+
+def resize(image: Array, size: tuple[int, int]) -> Array:
+    """Crop an (H, W, 3) uint8 image to the centre and resize it; one of that size is returned as it is."""
+    if image.shape[:2] == tuple(size):
+        return image
+    import torch
+
+    return fitted(torch.tensor(image)[None], size, "crop")[0].numpy()
+
+
+def decode_image(content: bytes, size: tuple[int, int] | None = None) -> Array:
+    """Decode the content of an image file, (H, W, 3) uint8; grey becomes equal colours, transparency is dropped.
+
+    A UserError if it is damaged, of another kind, or its header has another `size` (height, width), or too many pixels.
+    """
+    try:
+        with Image.open(io.BytesIO(content), formats=FORMATS) as image:
+            height, width = image.height, image.width
+            wanted = size or (height, width)
+            if image.mode not in MODES or (height, width) != wanted or height * width > MOST_PIXELS:
+                asked = f", not {wanted[0]} x {wanted[1]} of {', '.join(MODES)}"
+                raise UserError(f"the image is {height} x {width} pixels of {image.mode}{asked}")
+            return np.array(image.convert("RGB"))
+    except UnidentifiedImageError as error:  # whose text has an address in memory
+        raise UserError(f"the image cannot be decoded: it is not {' or '.join(FORMATS)}") from error
+    except (OSError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError) as error:
+        raise UserError(f"the image cannot be decoded ({str(error)[:200]})") from error

@@ -1,4 +1,4 @@
-"""`job=export`: export the demonstrations to another format, or a trained policy to programs."""
+"""`job=export`: export the demonstrations to another format."""
 
 from __future__ import annotations
 

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
-import torch.nn.functional as F
 from torch import Tensor
 
+from vla.io.images import Fit, fitted
 from vla.models.layers import Batch
-
-Fit = Literal["crop", "pad", "stretch"]
 
 
 @dataclass(frozen=True)
@@ -31,26 +28,9 @@ class Resize:
 
     def __call__(self, images: Tensor) -> Tensor:
         """Resize (B, T, H, W, 3) uint8 images; those of the size are returned as they are."""
-        (height, width), shape = self.size, images.shape[2:4]
-        if tuple(shape) == self.size:
+        if tuple(images.shape[2:4]) == self.size:
             return images
-        x = images.flatten(0, 1).permute(0, 3, 1, 2)
-        rows, columns = height, width  # of the result that show the images
-        if self.fit == "crop":
-            scale = min(shape[0] / height, shape[1] / width)
-            kept = max(round(scale * height), 1), max(round(scale * width), 1)
-            top, left = ((whole - part) // 2 for whole, part in zip(shape, kept, strict=True))
-            x = x[:, :, top : top + kept[0], left : left + kept[1]]
-        elif self.fit == "pad":
-            scale = min(height / shape[0], width / shape[1])
-            rows, columns = max(round(scale * shape[0]), 1), max(round(scale * shape[1]), 1)
-        if images.is_cuda:  # where torch interpolates no integers
-            x = F.interpolate(x.float(), (rows, columns), mode="bilinear", antialias=True).round_().clamp_(0, 255)
-        else:
-            x = F.interpolate(x, (rows, columns), mode="bilinear", antialias=True)
-        top, left = (height - rows) // 2, (width - columns) // 2
-        x = F.pad(x, (left, width - columns - left, top, height - rows - top))
-        return x.to(images.dtype).permute(0, 2, 3, 1).unflatten(0, images.shape[:2]).contiguous()
+        return fitted(images.flatten(0, 1), self.size, self.fit).unflatten(0, images.shape[:2])
 
 
 @dataclass(frozen=True)

@@ -221,4 +221,4 @@ def _resized(camera: str, picture: Any, size: tuple[int, int]) -> Array:
         raise UserError(
             f"task.images.{camera} names no (H, W, 3) image of uint8, but {picture.dtype} of {picture.shape}"
         )
-    return resize(np.ascontiguousarray(picture), size, "centre")
+    return resize(picture, size)

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -27,9 +27,6 @@ from vla.parallel.pool import THIS_PROCESS, Cluster, WorkersLost
 from vla.spec import Array, Spec
 
 MILLIMETRE = np.float32(0.001)  # [m]
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 class Files:
@@ -48,11 +45,8 @@ class Files:
         self._folder = Path(folder).resolve()
 
     def export(self, store: EpisodeStore, cluster: Cluster = THIS_PROCESS) -> Path:
-        """Write the missing episodes, each atomically; returns the folder.
-
-        Raises:
-            UserError: the folder holds an episode of another store, or the store is damaged.
-        """
+        """Write the missing episodes, each atomically; returns the folder (UserError: the folder holds an episode of
+        another store, or the store is damaged)."""
         self._folder.mkdir(parents=True, exist_ok=True)
         with staging_folder(self._folder) as place:
             missing = [number for number in range(len(store.episodes)) if not self._is_exported(store, number)]
@@ -127,18 +121,11 @@ def staging_folder(folder: Path) -> Iterator[Path]:
 
 
 def map_episodes(
-    work: Callable[[EpisodeStore, Item], Result],
-    store: EpisodeStore,
-    items: Sequence[Item],
-    cluster: Cluster,
-) -> Generator[Result]:
-    """Yield the results of `work(store, item)` in the order of the items, computed on a cluster.
-
-    Raises:
-        UserError: raised by `work` or by the cluster.
-    """
-    folder = store.folder.resolve()
-    make = partial(_ExportWorker, work, folder, len(store.episodes))
+    work: Callable[[EpisodeStore, Any], Any], store: EpisodeStore, items: Sequence[Any], cluster: Cluster
+) -> Generator[Any]:
+    """Yield the results of `work(store, item)` in the order of the items, computed on a cluster (UserError: raised by
+    `work` or by the cluster)."""
+    make = partial(_ExportWorker, work, store.folder.resolve(), len(store.episodes))
     with cluster.pool(make) as pool:
         pending = deque(map(pool.submit, items))
         try:
@@ -147,13 +134,13 @@ def map_episodes(
             raise WorkersLost(f"{lost}; written files are kept, run again to continue") from lost
 
 
-class _ExportWorker(Generic[Item, Result]):
+class _ExportWorker:
     """Worker that opens the store once per process."""
 
-    def __init__(self, work: Callable[[EpisodeStore, Item], Result], folder: Path, episodes: int) -> None:
+    def __init__(self, work: Callable[[EpisodeStore, Any], Any], folder: Path, episodes: int) -> None:
         self._work, self._store = work, EpisodeStore(folder, episodes)
 
-    def attempt(self, item: Item) -> Result:
+    def attempt(self, item: Any) -> Any:
         """Process one item."""
         return self._work(self._store, item)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vla.data.episodes import EpisodeStore
+from vla.data.episodes import EpisodeStore, observations_of
 from vla.io.errors import UserError
 from vla.io.printable import track
 from vla.spec import Array, Episode, Spec
@@ -24,6 +24,7 @@ OUTLIER_QUANTILES = (0.01, 0.99)
 OUTLIER_MARGIN = 0.5  # by which bounds exceed the quantiles, as a fraction of the distance between these
 # Distance between the quantiles, as a fraction of the range, below which rare values are no outliers.
 RARE_EVENT_SPREAD = 0.02
+BOUNDS_TOLERANCE = 1e-3  # of the bounds of actions, as a fraction of their range
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,8 @@ class ImportedDemonstrations(ABC):
 
     @classmethod
     def recording(cls, **options: Any) -> Recording:
-        """Describe the recording that `options`, the arguments of the constructor but the spec, name.
-
-        Raises:
-            UserError: it is missing or damaged, or this format is for given tasks only.
-        """
+        """Describe the recording that `options`, the arguments of the constructor but the spec, name (UserError: it is
+        missing or damaged, or this format is for given tasks only)."""
         raise UserError(f"{cls.__name__} does not describe its recordings: choose the task that they are of")
 
     @abstractmethod
@@ -60,12 +58,35 @@ class ImportedDemonstrations(ABC):
     def episode(self, number: int) -> Episode:
         """Return one episode; its number is its seed."""
 
-    def fill(self, store: EpisodeStore, episodes: int) -> int:
-        """Append episodes until the store holds `episodes`; returns the number appended.
+    def recorded_episode(
+        self,
+        number: int,
+        instruction: str,
+        outcome: str,
+        recorded: Mapping[str, Any],
+        rows: Mapping[str, Array],
+        actions: Array,
+        executed: Array | None = None,
+    ) -> Episode:
+        """Make an episode of its rows, by field, without depth, which is 0, and of actions (N, D), to be clipped."""
+        spec = self.spec
+        depth = {f"depth_{camera}": np.zeros((len(actions), *spec.image_size), np.uint16) for camera in spec.depth}
+        clipped = np.clip(actions, spec.low, spec.high).astype(np.float32)
+        return Episode(
+            seed=number,
+            task="recorded",
+            instruction=instruction,
+            outcome=outcome,
+            milestones=frozenset(),
+            draws={"recorded": recorded},
+            observations=observations_of(spec, {**rows, **depth}, instruction),
+            actions=clipped,
+            executed=clipped if executed is None else executed,
+        )
 
-        Raises:
-            UserError: there are too few, the store holds other ones, one is damaged, or the disk is full.
-        """
+    def fill(self, store: EpisodeStore, episodes: int) -> int:
+        """Append episodes until the store holds `episodes`; returns the number appended (UserError: there are too few,
+        the store holds other ones, one is damaged, or the disk is full)."""
         if episodes > len(self):
             raise UserError(f"there are only {len(self)} recorded episodes: set collect.episodes={len(self)}, or fewer")
         if episodes < len(self):
@@ -103,3 +124,25 @@ def action_bounds(values: Array) -> tuple[float, float]:
         least, most = max(least, low - OUTLIER_MARGIN * (high - low)), min(most, high + OUTLIER_MARGIN * (high - low))
     apart = 1e-3 * max(1.0, abs(least)) if least == most else 0.0
     return least - apart, most + apart
+
+
+def out_of_bounds(actions: Array, spec: Spec, most: float) -> list[str]:
+    """Describe the components of which more than the share `most` of the (N, D) actions exceeds the bounds of a spec:
+    they have other units."""
+    found = list[str]()
+    for index, (name, low, high) in enumerate(zip(spec.action, spec.low, spec.high, strict=True)):
+        values, slack = actions[:, index], BOUNDS_TOLERANCE * (high - low)
+        if (beyond := ((values < low - slack) | (values > high + slack)).mean()) > most:
+            unit = "" if spec.units[index] == "1" else f" {spec.units[index]}"
+            found.append(
+                f"{name} in action from {values.min():.3g} to {values.max():.3g}, the task has {low:g} to {high:g}"
+                f"{unit}, beyond which are {beyond:.0%} (other units, or absolute?)"
+            )
+    return found
+
+
+def log_clipped(actions: Array, spec: Spec) -> None:
+    """Log how many of the (N, D) actions are clipped to the bounds of a spec."""
+    clipped = np.clip(actions, np.array(spec.low, np.float32), np.array(spec.high, np.float32))
+    if share := float((clipped != actions).mean()):
+        log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * share)

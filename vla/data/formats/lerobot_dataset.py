@@ -9,7 +9,6 @@ Shapes: N steps, D components, H by W pixels.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,12 +20,12 @@ import pyarrow.parquet as pq
 
 from vla.data.formats import lerobot_layout as layout
 from vla.data.formats import lerobot_tables as tables
-from vla.data.formats.lerobot_images import decode, decode_file, require_video
-from vla.data.formats.lerobot_tables import COUNTS, DEPTHS, MEND, NUMBERS, PICTURES, REMEDY, TIMES
+from vla.data.formats.lerobot_images import decode, require_video
+from vla.data.formats.lerobot_tables import COUNTS, MEND, NUMBERS, PICTURES, REMEDY, TIMES
 from vla.data.index import listed
 from vla.io.documents import read_bounded, read_json
 from vla.io.errors import UserError
-from vla.io.images import resize
+from vla.io.images import decode_image, resize
 from vla.spec import LONGEST_INSTRUCTION, Array
 
 IMAGES = ("video", "image")
@@ -52,7 +51,8 @@ class Part:
 
 
 class LeRobotDataset:
-    """Metadata, instructions and episodes of a dataset, version 3.0.
+    """Metadata, instructions and episodes of a dataset, version 3.0 (UserError: the dataset is missing, incomplete,
+    damaged, of another version, contradicts itself, names images that it does not have, or has several rates).
 
     Attributes:
         folder: of the dataset.
@@ -63,10 +63,6 @@ class LeRobotDataset:
     Args:
         folder: of the dataset.
         images: camera → key; None: every feature of images, named without `observation.images.`.
-
-    Raises:
-        UserError: the dataset is missing, incomplete, damaged, of another version, contradicts itself, names images
-            that it does not have, or has several rates.
     """
 
     def __init__(self, folder: Path, images: Mapping[str, str] | None) -> None:
@@ -86,12 +82,10 @@ class LeRobotDataset:
         return self.info.fps
 
     def components(self, keys: Sequence[str], anonymous: Sequence[str] = ()) -> dict[str, tuple[str, int]]:
-        """Return component → its feature and index, of several features in order.
+        """Return component → its feature and index, of several features in order (UserError: there is no such feature,
+        or it is no vector of a reasonable size).
 
         Unnamed components are called by `anonymous` if there are as many, else by their feature and index.
-
-        Raises:
-            UserError: there is no such feature, or it is no vector of a reasonable size.
         """
         features = self.info.features
         vectors = [key for key, feature in features.items() if len(feature.shape) == 1]
@@ -119,7 +113,7 @@ class LeRobotDataset:
         found = dict[str, Array]()
         for key in keys:
             size = self.info.features[key].shape[0]
-            values = tables.array(rows[key], size)
+            values = tables.vectors(rows[key], size)
             if values is None or not len(values):
                 raise UserError(
                     f"{self.folder}/data has rows of {key} without the {size} numbers that meta/info.json states: "
@@ -129,31 +123,20 @@ class LeRobotDataset:
             found[key] = values
         return found
 
-    def require_images(self, cameras: Sequence[str], depth: Sequence[str]) -> None:
-        """Require images of cameras and the features `depth`; decodes the first image of each camera alone.
-
-        Raises:
-            UserError: a file is missing or damaged, or contradicts others.
-        """
+    def require_images(self, cameras: Sequence[str]) -> None:
+        """Require the images of cameras; decodes the first one of each camera alone (UserError: a file is missing or
+        damaged, or contradicts others)."""
         images = [self.images[camera] for camera in cameras]
         self._require_videos([key for key in images if self._is_video(key)])
-        columns = {key: PICTURES for key in images if not self._is_video(key)} | dict.fromkeys(depth, DEPTHS)
         for path in tables.files(self.folder / "data"):
-            tables.require(path, columns)
+            tables.require(path, {key: PICTURES for key in images if not self._is_video(key)})
         for key in images:
             next(self._decoded(self.parts[0], key, 1))
 
     def frames(self, part: Part, camera: str, size: tuple[int, int], every: int) -> Array:
         """Return every `every`-th image of a part, (N, H, W, 3) uint8, cropped at the centre and resized to `size`."""
         images = self._decoded(part, self.images[camera], every)
-        return np.stack([resize(image, size, "centre") for image in images])
-
-    def depths(self, part: Part, key: str, size: tuple[int, int]) -> Array:
-        """Return the depth images of a part, (N, H, W) uint16 [mm]; a UserError if they are of another `size`."""
-        values = tables.array(self._column(part, key, DEPTHS), *size, dtype=np.uint16)
-        if values is None:
-            raise UserError(f"{self.folder} has {key} of another size in episode {part.episode}: {MEND}")
-        return values
+        return np.stack([resize(image, size) for image in images])
 
     def _read_parts(self, videos: Sequence[str]) -> list[Part]:
         """Return the parts of all episodes, in order, with the places of the `videos`, keys of features."""
@@ -161,11 +144,8 @@ class LeRobotDataset:
         paths = tables.files(self.folder / "data")
         rows = tables.read(paths, {OWNER: COUNTS, TASK: COUNTS, TIME: NUMBERS})
         file = np.repeat(np.arange(len(paths)), [pq.read_metadata(path).num_rows for path in paths])
-        owner, tasks, stamps = (
-            rows[OWNER].to_numpy(),
-            rows[TASK].to_numpy(),
-            tables.array(rows[TIME], 1, dtype=np.float64),
-        )
+        owner, tasks = rows[OWNER].to_numpy(), rows[TASK].to_numpy()
+        stamps = tables.vectors(rows[TIME], 1, np.float64)
         if stamps is None:
             raise UserError(f"{self.folder}/data has rows of {TIME} that are not one number: {MEND}")
         self._require_finite(TIME, stamps, owner)
@@ -214,10 +194,6 @@ class LeRobotDataset:
             raise UserError(f"{self.folder} has no episodes: record some first")
         return rows
 
-    def _column(self, part: Part, key: str, kind: tables.Kind) -> tables.Column:
-        """Return the rows of a part in a column that is too large for memory."""
-        return tables.read(part.files, {key: kind}, [(OWNER, "=", part.episode)])[key][part.steps]
-
     def _is_video(self, key: str) -> bool:
         return self.info.features[key].dtype == "video"
 
@@ -227,10 +203,10 @@ class LeRobotDataset:
             start, fps = self._begin(part, key) + part.steps.start / self.info.fps, layout.fraction(self.info.fps)
             yield from decode(self._video(part, key), start, len(part), fps, size, every)
             return
-        column = self._column(part, key, PICTURES)
+        column = tables.read(part.files, {key: PICTURES}, [(OWNER, "=", part.episode)])[key][part.steps]
         for step in range(0, len(part), every):
             try:
-                yield decode_file(self._content(column[step].as_py() or {}), size)
+                yield decode_image(self._content(column[step].as_py() or {}), size)
             except UserError as error:
                 step += part.steps.start
                 raise UserError(f"{self.folder}: {key} of episode {part.episode}, step {step}: {error}") from error
@@ -296,11 +272,10 @@ class LeRobotDataset:
         """Require the rows (N, D) of a feature to be finite; `owner` (N,) are their episodes."""
         if len(wrong := np.argwhere(~np.isfinite(values))):
             row, at = wrong[0]
-            step, others = (owner[:row] == owner[row]).sum(), len(set(wrong[:, 0])) - 1
-            more = f", as in {others} other steps" if others else ""
+            step, steps = (owner[:row] == owner[row]).sum(), len(set(wrong[:, 0]))
             raise UserError(
-                f"{self.folder}: {name} is {values[row, at]} at index {at} in episode {owner[row]}, step {step}{more}: "
-                "correct the numbers, or delete the episodes with lerobot-edit-dataset"
+                f"{self.folder}: {name} is {values[row, at]} at index {at} in episode {owner[row]}, step {step}, the "
+                f"first of {steps}: correct the numbers, or delete the episodes with lerobot-edit-dataset"
             )
 
 
@@ -314,13 +289,9 @@ def _read_info(folder: Path) -> layout.Info:
         raise UserError(f"{error}: {REMEDY}") from error
     if version == layout.VERSION:
         return read_json(path, layout.Info)
-    match = re.fullmatch(r"v(\d{1,4})\.(\d{1,4})", version)
-    if match and int(match[1]) >= 3:
-        raise UserError(
-            f"{path} has version {version}, newer than {layout.VERSION}, which is read here: look for a newer vla"
-        )
-    has = f"has version {version}: convert" if match else f"has no version, but {version[:20]}: write or convert"
-    raise UserError(f"{path} {has} the dataset to {layout.VERSION} with lerobot")
+    raise UserError(
+        f"{path} has version {version[:20]}, and {layout.VERSION} is read here: convert an older dataset with lerobot"
+    )
 
 
 def _read_instructions(path: Path) -> dict[int, str]:

@@ -52,22 +52,17 @@ class LeRobotExporter:
     Args:
         folder: of the dataset; created when it is complete.
         crf: quality of the videos, from 0 (best) to 63.
-        depth: add depth as arrays [mm], 0: no return; reading a step then takes several times as long.
     """
 
-    def __init__(self, folder: Text | Path, crf: Annotated[int, Ge(0), Le(63)], depth: bool) -> None:
-        self._folder = Path(folder).resolve()
-        self._crf, self._depth = crf, depth
+    def __init__(self, folder: Text | Path, crf: Annotated[int, Ge(0), Le(63)]) -> None:
+        self._folder, self._crf = Path(folder).resolve(), crf
 
     def export(self, store: EpisodeStore, cluster: Cluster = THIS_PROCESS) -> Path:
-        """Write the dataset, or resume an interrupted export; returns the folder.
-
-        Raises:
-            UserError: the folder has other content, or the store is damaged or empty.
-        """
+        """Write the dataset, or resume an interrupted export; returns the folder (UserError: the folder has other
+        content, or the store is damaged or empty)."""
         store.require_episodes()
         episodes = [provenance(entry) for entry in store.episodes]
-        source = {"spec": store.spec.to_dict(), "crf": self._crf, "depth": self._depth, "episodes": episodes}
+        source = {"spec": store.spec.to_dict(), "crf": self._crf, "episodes": episodes}
         with staging_folder(self._folder) as place:
             if _holds(self._folder, source):
                 return self._folder
@@ -97,17 +92,12 @@ class LeRobotExporter:
         statistics = {name: _moments(values) for name, values in whole.items()}
         for camera, counts in histograms.items():
             statistics[layout.IMAGES + camera] = _image_moments(np.sum(counts, 0), len(whole["index"]))
-        depths = {camera: store.rows(f"depth_{camera}") for camera in store.spec.depth if self._depth}
-        rows = (
-            numbers | {layout.DEPTH + camera: values[entry.span] for camera, values in depths.items()}
-            for entry, numbers in zip(store.episodes, columns, strict=True)
-        )
-        write_rows(_made(draft / layout.place(layout.DATA)), rows)
+        write_rows(_made(draft / layout.place(layout.DATA)), columns)
         table = pa.Table.from_pylist(episodes)
         pq.write_table(table, _made(draft / layout.place(layout.EPISODES)), write_page_checksum=True)
         write_tasks(draft / layout.TASKS, tasks)
         write_json(draft / "meta/stats.json", statistics)
-        info = layout.info(store.spec, self._depth, len(episodes), len(whole["index"]), len(tasks))
+        info = layout.info(store.spec, len(episodes), len(whole["index"]), len(tasks))
         write_json(draft / "meta/info.json", info)
         write_json(draft / layout.CHECKSUMS, layout.checksums(draft))
 

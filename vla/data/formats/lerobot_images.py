@@ -1,24 +1,19 @@
-"""Images of a LeRobot dataset: AV1 videos, encoded and decoded with PyAV, and image files in tables.
+"""Videos of a LeRobot dataset, AV1, encoded and decoded with PyAV.
 
 Shapes: N frames, H by W pixels.
 """
 
 from __future__ import annotations
 
-import io
 import os
-import struct
 import sys
-import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 
 import av
-import numpy as np
 from av.video.frame import PictureType
-from PIL import Image, UnidentifiedImageError
 
 from vla.io.errors import UserError
 from vla.io.files import require_file
@@ -26,8 +21,6 @@ from vla.spec import Array
 
 CODEC = "libsvtav1"
 PIXELS = "yuv420p"  # the only layout that the encoder supports
-FORMATS = ("PNG", "JPEG", "WEBP")  # of images in tables
-MODES = ("RGB", "RGBA", "L", "LA", "P")  # of Pillow, with 8 bits per channel
 
 
 def encode(path: Path, clips: Iterable[Array], size: tuple[int, int], fps: Fraction, crf: int) -> None:
@@ -75,11 +68,8 @@ def _open_codec(stream: av.VideoStream) -> None:
 def decode(
     path: Path, start: float, count: int, fps: Fraction, size: tuple[int, int], every: int = 1
 ) -> Iterator[Array]:
-    """Yield every `every`-th of `count` frames of a video from `start` [s] on, (H, W, 3) uint8 of `size` (H, W).
-
-    Raises:
-        UserError: the video cannot be read, has images of another size, or lacks a frame.
-    """
+    """Yield every `every`-th of `count` frames of a video from `start` [s] on, (H, W, 3) uint8 of `size` (H, W)
+    (UserError: the video cannot be read, has images of another size, or lacks a frame)."""
     wanted = 0
     with _opened(path) as (file, stream):
         _require_size(path, stream, size)  # before anything is decoded
@@ -128,20 +118,3 @@ def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoS
 def _require_size(path: Path, images: av.VideoStream | av.VideoFrame, size: tuple[int, int]) -> None:
     if (images.height, images.width) != size:
         raise UserError(f"{path} has images of {images.height} x {images.width} pixels, not {size[0]} x {size[1]}")
-
-
-def decode_file(content: bytes, size: tuple[int, int]) -> Array:
-    """Decode the content of an image file, (H, W, 3) uint8, if its header has this `size` (H, W).
-
-    Grey becomes equal colours; transparency is dropped. A UserError if it is of another size or kind, or damaged.
-    """
-    try:
-        with Image.open(io.BytesIO(content), formats=FORMATS) as image:
-            if image.mode not in MODES or (image.height, image.width) != size:  # before memory is taken for it
-                wanted = f"{size[0]} x {size[1]} of {', '.join(MODES)}"
-                raise UserError(f"the image is {image.height} x {image.width} pixels of {image.mode}, not {wanted}")
-            return np.asarray(image.convert("RGB"))
-    except UnidentifiedImageError as error:  # whose text has an address in memory
-        raise UserError(f"the image cannot be decoded: it is not {' or '.join(FORMATS)}") from error
-    except (OSError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError) as error:
-        raise UserError(f"the image cannot be decoded ({str(error)[:200]})") from error

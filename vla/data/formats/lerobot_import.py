@@ -13,28 +13,28 @@ from typing import Annotated
 import numpy as np
 from annotated_types import MinLen, Predicate
 
-from vla.data.episodes import EpisodeStore, observations_of
+from vla.data.episodes import EpisodeStore
+from vla.data.formats import imported_demonstrations as imported
 from vla.data.formats import lerobot_layout as layout
-from vla.data.formats.imported_demonstrations import ImportedDemonstrations, Recording, action_bounds
-from vla.data.formats.lerobot_dataset import LeRobotDataset, Part
+from vla.data.formats.lerobot_dataset import LeRobotDataset
 from vla.io.errors import UserError
-from vla.io.images import describe_resize
 from vla.io.types import Count, Text, unique
 from vla.spec import Array, Episode, Spec
 
 Keys = Annotated[list[Text], MinLen(1), Predicate(unique)]
 Places = Mapping[str, tuple[str, int]]  # component → feature and index
 
-# Largest share of a component's actions beyond its bounds, and tolerance relative to its range. A larger share means
-# other units. Bounds from quantiles exclude 2 % of the actions.
-MAX_OUTSIDE, BOUNDS_TOLERANCE = 0.02, 1e-3
+# Largest share of a component's actions beyond its bounds; a larger one means other units. Bounds from quantiles
+# exclude 2 % of the actions.
+MAX_OUTSIDE = 0.02
 MAX_NAMES = 200  # characters of names from a dataset in a message
 
 log = logging.getLogger(__name__)
 
 
-class LeRobotDemonstrations(ImportedDemonstrations):
-    """Episodes of a LeRobot dataset, version 3.0, that has the cameras, state, action and rate of the task.
+class LeRobotDemonstrations(imported.ImportedDemonstrations):
+    """Episodes of a LeRobot dataset, version 3.0, that has the cameras, state, action and rate of the task (UserError:
+    the dataset is missing or damaged, or differs from the task; the message lists all differences).
 
     Images are videos, or PNG, JPEG or WebP in tables or files; those of another size are cropped at the centre
     to the aspect ratio of the task, and resized. Actions beyond the bounds of the task are clipped. Every episode is a
@@ -49,9 +49,6 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         state, action: keys of the features that hold the components, which are found by name.
         every: keep every n-th frame with the last of n actions, which suits absolute actions only.
         spec: of the task.
-
-    Raises:
-        UserError: the dataset is missing or damaged, or differs from the task; the message lists all differences.
     """
 
     def __init__(
@@ -66,49 +63,43 @@ class LeRobotDemonstrations(ImportedDemonstrations):
     ) -> None:
         self.spec, self._every = spec.without_truth, every
         self._dataset = dataset = self._opened(folder, images)
-        features, ours = dataset.info.features, layout.features(spec, depth=True)
+        features = dataset.info.features
         self._state = dataset.components(state, [spec.state[index] for index in spec.pose])
         self._action = dataset.components(action, spec.action)
         rates = [key for key in (layout.RATES,) if key in features and features[key].components]
         for name, place in dataset.components(rates).items():
             self._state.setdefault(name, place)
-
-        def has(*keys: str) -> bool:
-            return all(key in features and features[key].is_like(ours[key]) for key in keys)
-
-        depth, executed = [layout.DEPTH + camera for camera in spec.depth], has(layout.EXECUTED)
-        self._lacks = [] if has(*depth) else ["depth"]
-        self._lacks += [] if executed else [layout.EXECUTED]
+        same = layout.EXECUTED in features and features[layout.EXECUTED].components == [*spec.action]
+        executed = [layout.EXECUTED] if same else []
+        self._lacks = [*(["depth"] if spec.depth else []), *([] if executed else [layout.EXECUTED])]
         self._lacks += [] if all(name in self._state for name in spec.state) else [layout.RATES]
-        self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
         differences = [*self._mismatches()]
         if all(name in self._action for name in spec.action):
-            read = [*state, *action, *rates, *([layout.EXECUTED] if executed else [])]
+            read = [*state, *action, *rates, *executed]
             self._numbers = dataset.read(list(dict.fromkeys(read)))
-            actions = self._columns(spec.action, self._action, slice(None))
-            differences += _out_of_bounds(actions, spec)
-            self._beyond = float(((actions < self._low) | (actions > self._high)).mean())
+            self._actions = self._columns(spec.action, self._action, slice(None))
+            differences += imported.out_of_bounds(self._actions, spec, MAX_OUTSIDE)
         if differences:
             raise UserError(f"{dataset.folder} does not match the task: {'; '.join(differences)}")
         for camera in spec.cameras:
             key = dataset.images[camera]
             spec.require_cut(camera, features[key].image_size, f"{key} of {dataset.folder}")
-        dataset.require_images(spec.cameras, depth if has(*depth) else [])
+        dataset.require_images(spec.cameras)
 
     @classmethod
     def recording(
         cls, folder: Path | str | None, images: dict[str, Text] | None, state: Keys, action: Keys, every: Count
-    ) -> Recording:
+    ) -> imported.Recording:
         """Describe a dataset, see `ImportedDemonstrations.recording`."""
         dataset = cls._opened(folder, images)
         states, actions = dataset.components(state), dataset.components(action)
         values = dataset.read(action)
-        return Recording(
+        return imported.Recording(
             cameras=tuple(dataset.images),
             control_hz=dataset.info.fps / every,
             state=tuple(states),
             action=tuple(actions),
-            bounds={name: action_bounds(values[key][:, at]) for name, (key, at) in actions.items()},
+            bounds={name: imported.action_bounds(values[key][:, at]) for name, (key, at) in actions.items()},
             episodes=len(dataset.parts),
         )
 
@@ -121,34 +112,24 @@ class LeRobotDemonstrations(ImportedDemonstrations):
         spec, dataset, part = self.spec, self._dataset, self._dataset.parts[number]
         first = np.arange(part.steps.start, part.steps.stop, self._every)
         last = np.minimum(first + self._every - 1, part.steps.stop - 1)  # the target at the end of the period
-        actions = np.clip(self._columns(spec.action, self._action, part.rows[last]), self._low, self._high)
         images = {
             f"rgb_{camera}": dataset.frames(part, camera, spec.image_size, self._every) for camera in spec.cameras
         }
-        images |= {f"depth_{camera}": self._depth(part, camera)[:: self._every] for camera in spec.depth}
-        return Episode(
-            seed=number,
-            task="recorded",
-            instruction=part.instruction,
-            outcome="success",
-            milestones=frozenset(),
-            draws={"recorded": {"episode": part.episode, "first_step": part.steps.start, "lacks": self._lacks}},
-            observations=observations_of(spec, {**images, "state": self._states(part.rows)[first]}, part.instruction),
-            actions=actions,
-            executed=actions if layout.EXECUTED in self._lacks else self._numbers[layout.EXECUTED][part.rows[last]],
-        )
+        recorded = {"episode": part.episode, "first_step": part.steps.start, "lacks": self._lacks}
+        executed = None if layout.EXECUTED in self._lacks else self._numbers[layout.EXECUTED][part.rows[last]]
+        rows, actions = {**images, "state": self._states(part.rows)[first]}, self._actions[part.rows[last]]
+        return self.recorded_episode(number, part.instruction, "success", recorded, rows, actions, executed)
 
     def fill(self, store: EpisodeStore, episodes: int) -> int:
         """Append episodes, and log what an import changes: images, episodes of several tasks, actions beyond bounds."""
         for camera in self.spec.cameras:
             shape = self._dataset.info.features[self._dataset.images[camera]].image_size
-            if resizing := describe_resize(shape, self.spec.image_size, "centre"):
-                log.info("camera %s: %s", camera, resizing)
+            if shape != tuple(self.spec.image_size):
+                log.info("images of %s are cropped at the centre and resized to task.image_size", camera)
         whole = len({part.episode for part in self._dataset.parts})
         if whole < len(self):
             log.info("%d episodes become %d, one per instruction: the task changes within some", whole, len(self))
-        if self._beyond:
-            log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * self._beyond)
+        imported.log_clipped(self._actions, self.spec)
         return super().fill(store, episodes)
 
     @staticmethod
@@ -186,24 +167,6 @@ class LeRobotDemonstrations(ImportedDemonstrations):
     def _columns(self, names: Iterable[str], places: Places, rows: Array | slice) -> Array:
         """Return components by name, (N, …) float32, in rows of the dataset."""
         return np.stack([self._numbers[key][rows, at] for key, at in map(places.__getitem__, names)], axis=1)
-
-    def _depth(self, part: Part, camera: str) -> Array:
-        """Return the depth of the steps of a part, (N, H, W) uint16 [mm]."""
-        if "depth" in self._lacks:
-            return np.zeros((len(part), *self.spec.image_size), np.uint16)
-        return self._dataset.depths(part, layout.DEPTH + camera, self.spec.image_size)
-
-
-def _out_of_bounds(actions: Array, spec: Spec) -> Iterator[str]:
-    """Yield the components of which more than a few of the (N, D) actions exceed the bounds of the spec."""
-    for index, (name, low, high) in enumerate(zip(spec.action, spec.low, spec.high, strict=True)):
-        values, slack = actions[:, index], BOUNDS_TOLERANCE * (high - low)
-        if (beyond := ((values < low - slack) | (values > high + slack)).mean()) > MAX_OUTSIDE:
-            unit = "" if spec.units[index] == "1" else f" {spec.units[index]}"
-            yield (
-                f"{name} in action from {values.min():.3g} to {values.max():.3g}, the task has {low:g} to "
-                f"{high:g}{unit}, beyond which are {beyond:.0%} (other units, or absolute?)"
-            )
 
 
 def _shortened(names: Iterable[str]) -> str:

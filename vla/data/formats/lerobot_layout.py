@@ -1,14 +1,12 @@
 """Layout of a LeRobot dataset, version 3.0: file names, features and metadata.
 
-    meta/info.json                            features, sizes and rate
-    meta/stats.json                           moments and quantiles of every feature
-    meta/tasks.parquet                        instruction → task_index
-    meta/episodes/chunk-000/file-000.parquet  range and statistics of every episode
-    data/chunk-000/file-000.parquet           one row per step
-    videos/observation.images.CAMERA/chunk-000/file-000.mp4     several episodes in sequence
-    meta/checksums.json                       file → CRC-32; only `vla` writes it
-
-Shapes: D components, H by W pixels.
+meta/info.json                            features, sizes and rate
+meta/stats.json                           moments and quantiles of every feature
+meta/tasks.parquet                        instruction → task_index
+meta/episodes/chunk-000/file-000.parquet  range and statistics of every episode
+data/chunk-000/file-000.parquet           one row per step
+videos/observation.images.CAMERA/chunk-000/file-000.mp4     several episodes in sequence
+meta/checksums.json                       file → CRC-32; only `vla` writes it
 """
 
 from __future__ import annotations
@@ -38,9 +36,9 @@ CHANNELS = (1, 3, 4)  # of images: grey, colours, colours and transparency
 RATE_TOLERANCE = 0.01  # relative; cameras of 29.97 Hz are said to have 30
 
 # LeRobot's policies use every feature "observation…" as an input, every "action…" as an output, and every image as a
-# colour image: other features have other names, and depth is an array.
+# colour image: other features have other names.
 STATE, ACTION, EXECUTED, RATES = "observation.state", "action", "executed", "velocities"
-IMAGES, DEPTH = "observation.images.", "depth."  # and the name of a camera
+IMAGES = "observation.images."  # and the name of a camera
 COUNTERS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64"}
 COUNTERS |= {"index": "int64", "task_index": "int64"}
 
@@ -72,10 +70,6 @@ class Feature:
             names = [name if apart else f"{key}_{name}" for key, name in parts]
         known = isinstance(names, list) and all(isinstance(name, str) for name in names)
         return names if known and [len(names)] == list(self.shape) else []
-
-    def is_like(self, other: dict[str, Any]) -> bool:
-        """Return whether this is the feature that an export describes so, see `features`."""
-        return {"dtype": self.dtype, "shape": [*self.shape], "names": self.names} == other
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -129,37 +123,24 @@ def fraction(hz: float) -> Fraction:
     return Fraction(hz).limit_denominator(1000)
 
 
-def features(spec: Spec, depth: bool) -> dict[str, dict[str, Any]]:
-    """Return the features in `info.json` for a spec, optionally with columns of depth."""
+def features(spec: Spec) -> dict[str, dict[str, Any]]:
+    """Return the features in `info.json` for a spec."""
     names = {STATE: [spec.state[index] for index in spec.pose], ACTION: [*spec.action], EXECUTED: [*spec.action]}
     if spec.rates:
         names[RATES] = [spec.state[index] for index in spec.rates]
     height, width = spec.image_size
-    video = {
-        "video.height": height,
-        "video.width": width,
-        "video.channels": 3,
-        "video.codec": "av1",
-        "video.pix_fmt": PIXELS,
-        "video.is_depth_map": False,
-        "video.fps": _fps(spec),
-        "has_audio": False,
-    }
-    image = _feature("video", [height, width, 3], ["height", "width", "channels"]) | {"info": video}
-    pixels = _feature("uint16", [height, width], ["height", "width"])
+    video = {"height": height, "width": width, "channels": 3, "codec": "av1", "pix_fmt": PIXELS}
+    video |= {"is_depth_map": False, "fps": _fps(spec)}
+    image = _feature("video", [height, width, 3], ["height", "width", "channels"])
+    image["info"] = {**{f"video.{name}": value for name, value in video.items()}, "has_audio": False}
     return {
         **{name: _feature("float32", [len(components)], components) for name, components in names.items()},
         **{IMAGES + camera: image for camera in spec.cameras},
-        **{DEPTH + camera: pixels for camera in spec.depth if depth},
         **{name: _feature(dtype, [1], None) for name, dtype in COUNTERS.items()},
     }
 
 
-def _feature(dtype: str, shape: list[int], names: list[str] | None) -> dict[str, Any]:
-    return {"dtype": dtype, "shape": shape, "names": names}
-
-
-def info(spec: Spec, depth: bool, episodes: int, frames: int, tasks: int) -> dict[str, Any]:
+def info(spec: Spec, episodes: int, frames: int, tasks: int) -> dict[str, Any]:
     """Return the content of `info.json`."""
     return {
         "codebase_version": VERSION,
@@ -174,8 +155,12 @@ def info(spec: Spec, depth: bool, episodes: int, frames: int, tasks: int) -> dic
         "splits": {"train": f"0:{episodes}"},
         "data_path": DATA,
         "video_path": VIDEOS,
-        "features": features(spec, depth),
+        "features": features(spec),
     }
+
+
+def _feature(dtype: str, shape: list[int], names: list[str] | None) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": shape, "names": names}
 
 
 def _fps(spec: Spec) -> float | int:

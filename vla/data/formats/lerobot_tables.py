@@ -1,12 +1,13 @@
 """Tables of a LeRobot dataset: untrusted ones are bounded in rows and of the expected types, and new ones.
 
-Shapes: N steps, D components, H by W pixels.
+Shapes: N steps, D components.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +30,8 @@ Column = pa.ChunkedArray
 Kind = tuple[str, Callable[[Column], bool]]  # what a column must hold, and whether it does
 
 
-def _within_lists(kind: pa.DataType) -> tuple[int, pa.DataType]:
-    """Return how deep lists are nested, and the type of what they hold."""
-    depth = 0
-    while pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind):
-        depth, kind = depth + 1, kind.value_type
-    return depth, kind
+def _is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)
 
 
 def is_text(kind: pa.DataType) -> bool:
@@ -43,8 +40,8 @@ def is_text(kind: pa.DataType) -> bool:
 
 
 def _are_numbers(column: Column) -> bool:
-    depth, kind = _within_lists(column.type)
-    return depth <= 1 and (pa.types.is_floating(kind) or pa.types.is_integer(kind))
+    kind = column.type.value_type if _is_list(column.type) else column.type
+    return pa.types.is_floating(kind) or pa.types.is_integer(kind)
 
 
 def _are_files(column: Column) -> bool:
@@ -60,7 +57,6 @@ COUNTS: Kind = "integers from 0 on", lambda column: pa.types.is_integer(column.t
 TIMES: Kind = "seconds", lambda column: pa.types.is_floating(column.type) and _within(column, MAX_SECONDS)
 TEXTS: Kind = "text", lambda column: is_text(column.type) and not column.null_count
 NUMBERS: Kind = "lists of numbers", _are_numbers
-DEPTHS: Kind = "lists of lists of 16-bit integers", lambda column: _within_lists(column.type) == (2, pa.uint16())
 PICTURES: Kind = "images, as the bytes of a file", _are_files
 
 
@@ -72,11 +68,8 @@ def files(folder: Path) -> list[Path]:
 
 
 def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -> pa.Table:
-    """Read the named columns of Parquet files, concatenated; `only` filters rows.
-
-    Raises:
-        UserError: a file is damaged, is too large, or lacks a column of the expected type.
-    """
+    """Read the named columns of Parquet files, concatenated; `only` filters rows (UserError: a file is damaged, is too
+    large, or lacks a column of the expected type)."""
     tables = list[pa.Table]()
     for path in paths:
         require(path, columns)
@@ -135,17 +128,15 @@ def _require_kinds(path: Path, table: pa.Table, columns: Mapping[str, Kind]) -> 
             raise UserError(f"{path}: {name} does not hold {kind}: {MEND}")
 
 
-def array(column: Column, *shape: int, dtype: type[np.generic] = np.float32) -> Array | None:
-    """Return numbers, or nested lists of them, as (N, *shape), NaN if missing; None if rows have another shape."""
+def vectors(column: Column, size: int, dtype: type[np.floating] = np.float32) -> Array | None:
+    """Return numbers, or lists of them, as (N, size), NaN if missing; None if rows have another size."""
     rows = len(column)
-    for size in shape[: _within_lists(column.type)[0]]:
+    if _is_list(column.type):
         if not pc.all(pc.equal(pc.list_value_length(column), size)).as_py():
             return None
         column = pc.list_flatten(column)
-    if column.null_count and not issubclass(dtype, np.floating):
-        return None
     values = np.asarray(column.combine_chunks(), dtype)
-    return values.reshape(rows, *shape) if values.size == rows * np.prod(shape) else None
+    return values.reshape(rows, size) if values.size == rows * size else None
 
 
 def write_tasks(path: Path, tasks: Sequence[str]) -> None:
@@ -167,12 +158,12 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
 
 
 def write_rows(path: Path, episodes: Iterable[Mapping[str, Array]]) -> None:
-    """Write columns, each (N,), (N, D) or (N, H, W), with a row group per episode.
+    """Write columns, each (N,) or (N, D), with a row group per episode.
 
     The schema metadata has the types that the package `datasets` needs.
     """
-    writer: pq.ParquetWriter | None = None
-    try:
+    with ExitStack() as opened:
+        writer: pq.ParquetWriter | None = None
         for columns in episodes:
             features = {name: _feature(values) for name, values in columns.items()}
             metadata = {"huggingface": json.dumps({"info": {"features": features}})}
@@ -180,27 +171,16 @@ def write_rows(path: Path, episodes: Iterable[Mapping[str, Array]]) -> None:
             table = table.replace_schema_metadata(metadata)
             if writer is None:
                 writer = pq.ParquetWriter(path, table.schema, compression="zstd", write_page_checksum=True)
+                opened.enter_context(writer)
             writer.write_table(table)
-    finally:
-        if writer is not None:
-            writer.close()
 
 
 def _feature(values: Array) -> dict[str, Any]:
     """Return the type of a column for `datasets`."""
     value = {"dtype": values.dtype.name, "_type": "Value"}
-    if values.ndim == 1:
-        return value
-    if values.ndim == 2:
-        return {"feature": value, "length": values.shape[1], "_type": "List"}
-    return {"dtype": values.dtype.name, "shape": values.shape[1:], "_type": "Array2D"}
+    return value if values.ndim == 1 else {"feature": value, "length": values.shape[1], "_type": "List"}
 
 
 def _arrow(values: Array) -> pa.Array:
-    """Return a column with lists of fixed size of vectors, and lists of lists of images."""
     flat = pa.array(values.ravel())
-    if values.ndim == 2:
-        return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
-    for size in reversed(values.shape[1:]):
-        flat = pa.ListArray.from_arrays(pa.array(np.arange(0, len(flat) + 1, size, dtype=np.int32)), flat)
-    return flat
+    return flat if values.ndim == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])

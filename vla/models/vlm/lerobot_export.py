@@ -31,10 +31,12 @@ class LeRobotPolicyExporter:
         folder: output folder, which must not exist.
     """
 
+    of_policies = True
+
     def __init__(self, folder: Text | Path) -> None:
         self._folder = Path(folder).resolve()
 
-    def export_policy(self, policy: Any) -> Path:
+    def export(self, policy: Any) -> Path:
         """Write a policy; returns the folder.
 
         Raises:

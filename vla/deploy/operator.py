@@ -1,0 +1,190 @@
+"""What a person does with running nodes: instructs, resumes and hands over the agent, starts a simulator's episodes."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import time
+from collections.abc import Callable, Sequence
+from multiprocessing.process import BaseProcess
+from threading import Event
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from vla.deploy.messages import SimulatedEpisode
+from vla.io.errors import UserError
+from vla.rollouts.motion import Motion
+from vla.rollouts.results import Result
+
+log = logging.getLogger(__name__)
+
+TIMEOUT = 10.0  # of the discovery of a subscriber or service, of a service call, and of a status [s]
+SETTLED = 0.7  # discovery is complete after so long without a new subscriber [s]
+START, EPISODE = 60.0, 60.0  # longest start of both nodes of the demo, and longest episode [s]
+AGENT, SIMULATOR = "/vla_agent", "/vla_simulator"
+
+
+class Operator:
+    """Calls services of the agent and the simulator (UserError: a node is not there, does not respond, refuses or has
+    exited, in all methods).
+
+    Args:
+        node: calls them; it is spun here.
+        topic: of the instructions.
+        processes: those of the nodes, if they belong to the operator.
+    """
+
+    def __init__(self, node: Any, topic: str, processes: Sequence[BaseProcess] = ()) -> None:
+        self.node, self._processes = node, processes
+        self._words = node.create_publisher(String, topic, 1)
+        self.status: DiagnosticStatus | None = None  # newest of the agent
+        node.create_subscription(DiagnosticStatus, f"{AGENT}/status", self._on_status, 10)
+
+    @property
+    def values(self) -> dict[str, str]:
+        """Name → value in the newest status."""
+        return {pair.key: pair.value for pair in self.status.values} if self.status else {}
+
+    def wait(self, condition: Callable[[], bool], what: str, seconds: float = TIMEOUT) -> None:
+        """Spin until the condition `what` holds, for at most some seconds."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            if not all(process.is_alive() for process in self._processes):
+                raise UserError("a node has exited, see its log above")
+            if time.monotonic() > deadline:
+                raise UserError(
+                    f"timed out after {seconds:g} s, waiting for {what}: is its node running, and on the same network "
+                    "and domain?"
+                )
+            rclpy.spin_once(self.node, timeout_sec=0.02)
+
+    def call(self, kind: Any, service: str, request: Any) -> Any:
+        """Call a service and return its answer."""
+        client = self.node.create_client(kind, service)
+        try:
+            self.wait(client.service_is_ready, f"the service {service}")
+            answer = client.call_async(request)
+            self.wait(answer.done, f"an answer of {service}")
+            return answer.result()
+        finally:
+            self.node.destroy_client(client)
+
+    def say(self, instruction: str) -> None:
+        """Publish an instruction once all subscribers are discovered, and wait until they confirm it."""
+        found, since = 0, time.monotonic()
+
+        def settled() -> bool:  # they are discovered one by one, in any order: the simulator may come before the agent
+            nonlocal found, since
+            if (count := self._words.get_subscription_count()) != found:
+                found, since = count, time.monotonic()
+            return found > 0 and time.monotonic() - since > SETTLED
+
+        self.wait(settled, f"a subscriber on {self._words.topic_name}")
+        self._words.publish(String(data=instruction))
+        if not self._words.wait_for_all_acked(Duration(seconds=TIMEOUT)):
+            raise UserError("a subscriber does not confirm the instruction: does one of the nodes hang?")
+
+    def describe(self) -> str:
+        """Return the agent's status: its reason, then a line for each value."""
+        self.wait(lambda: self.status is not None, f"a message on {AGENT}/status")
+        assert self.status is not None
+        return "\n".join([self.status.message, *(f"  {name}: {value}" for name, value in self.values.items())])
+
+    def resume(self) -> None:
+        """Resume a stopped agent."""
+        _require(self.call(Trigger, f"{AGENT}/resume", Trigger.Request()))
+
+    def hand_over(self, to_person: bool) -> None:
+        """Make the agent leave the arm to a person, or take it back."""
+        _require(self.call(SetBool, f"{AGENT}/hand_over", SetBool.Request(data=to_person)))
+
+    def next_episode(self, reset: bool = True) -> str:
+        """Start the simulator's next episode, or only restart the agent, if there is one; it then waits to be told.
+
+        Returns the simulator's description of the episode.
+        """
+        client = self.node.create_client(ChangeState, f"{AGENT}/change_state")
+        there = client.wait_for_service(SETTLED)
+        self.node.destroy_client(client)
+        # The reset moves the arm: an active agent would pull it back.
+        active = there and self._change(Transition.TRANSITION_DEACTIVATE)
+        said = str(self.call(Trigger, f"{SIMULATOR}/reset", Trigger.Request()).message) if reset else ""
+        if active and not self._change(Transition.TRANSITION_ACTIVATE):
+            raise UserError("the agent cannot be activated again, see its log")
+        return said
+
+    def _change(self, transition: int) -> bool:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return bool(self.call(ChangeState, f"{AGENT}/change_state", request).success)
+
+    def _on_status(self, status: DiagnosticStatus) -> None:
+        self.status = status
+
+
+class DemoOperator(Operator):
+    """Plays the episodes of the closed-loop demo; `stopped` is set on interruption."""
+
+    def __init__(self, node: Any, topic: str, stopped: Event, agent: BaseProcess, simulator: BaseProcess) -> None:
+        super().__init__(node, topic, (agent, simulator))
+        self.stopped, self._simulator = stopped, simulator
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        node.create_subscription(String, f"{SIMULATOR}/episode", self._on_episode, latched)
+        self._episode: SimulatedEpisode | None = None
+        self.wait(lambda: self._words.get_subscription_count() >= 2, "both nodes to subscribe", START)
+
+    def play(self) -> Result | None:
+        """Play one episode; return None if it was interrupted."""
+        self.begin_episode()
+        self.wait(lambda: not self._playing or self.stopped.is_set(), "the end of an episode", EPISODE)
+        episode = self._episode
+        assert episode is not None
+        if not episode.done:
+            return None
+        details = {"task": episode.task, "milestones": episode.milestones, "motion": Motion(round(episode.seconds, 1))}
+        return Result(episode.seed, episode.outcome, episode.instruction, episode.steps, **details)
+
+    def begin_episode(self) -> None:
+        """Begin an episode, after the last has ended, and send its instruction."""
+        over = self._episode is not None and self._episode.done
+        if over:
+            self._episode = None
+        self.next_episode(reset=over)
+        self.wait(lambda: self._playing, "an episode")
+        assert self._episode is not None
+        self._words.publish(String(data=self._episode.instruction))
+
+    def watchdog_delay(self) -> float:
+        """Suspend the simulator until the agent holds the arm; returns the delay [s]."""
+        assert self._simulator.pid is not None
+        self.wait(lambda: self.values.get("state") == "running", "the agent to run")
+        os.kill(self._simulator.pid, signal.SIGSTOP)
+        started = time.monotonic()
+        try:
+            self.wait(lambda: self.values["state"] == "holding", "the agent to hold")
+            return time.monotonic() - started
+        finally:
+            os.kill(self._simulator.pid, signal.SIGCONT)
+
+    @property
+    def _playing(self) -> bool:
+        return self._episode is not None and not self._episode.done
+
+    def _on_episode(self, message: Any) -> None:
+        try:
+            self._episode = SimulatedEpisode.of(message)
+        except UserError as error:  # anybody on the network can send one
+            log.warning("dropped a message: %s", error)
+
+
+def _require(answer: Any) -> None:
+    if not answer.success:
+        raise UserError(answer.message)
