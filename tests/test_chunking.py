@@ -190,7 +190,8 @@ def test_training_with_prefixes_makes_a_plan_go_on_as_it_began() -> None:
     counts = {"remaining": torch.full((8,), 6), "delay": torch.full((8,), 2)}
     with torch.inference_mode():
         plans = model.predict({**batch, "running": ways[:, 0], **counts, "noise": torch.randn(8, 8, 3)}).actions
-    assert (plans[:, 2:, :2] - ways[:, 0, 2:, :2]).abs().max() < 0.03
+    away = (plans[:, 2:, :2] - ways[:, 0, 2:, :2]).abs()
+    assert away.max() < 0.04 and away.mean() < 0.02  # the other way is 0.08 away
 
 
 class Watched:
