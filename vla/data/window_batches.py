@@ -124,9 +124,8 @@ class WindowBatcher:
 
         A frame before the start of the episode is zero, absent, and has no valid label. A label is also invalid if a
         step between its frame and itself was perturbed, or if it lies beyond the end of the episode, where it repeats
-        the last action. The valid labels of a frame therefore come first. `perturbations` (B, T, k): perturbed steps
-        between a frame and each label, -1 beyond the episode. `unperturbed` (B, T): no step within a chunk was
-        perturbed.
+        the last action. The valid labels of a frame therefore come first. `unperturbed` (B, T): no step
+        within a chunk was perturbed.
         """
         episode = self._first.searchsorted(windows, side="right") - 1  # (B,)
         if not self._verified[episode].all():
@@ -135,10 +134,11 @@ class WindowBatcher:
         frames = windows[:, None] + self._ages  # (B, T)
         labels = frames[:, :, None] + self._aheads  # (B, T, k)
         present = frames >= first
-        inside = (labels <= last[:, :, None]) & present[:, :, None]
+        valid = (labels <= last[:, :, None]) & present[:, :, None]
         labels = np.minimum(np.maximum(labels, first[:, :, None]), last[:, :, None])
         frames = np.maximum(frames, first)
-        before = self._perturbations[labels] - self._perturbations[frames][:, :, None]
+        if len(self._aheads) > 1:  # no step lies between a frame and its first label
+            valid &= self._perturbations[labels] == self._perturbations[frames][:, :, None]
         absent = None if present.all() else ~present
         batch: Batch = {
             kind: {camera: self._take(rows, frames, absent) for camera, rows in cameras.items()}
@@ -152,8 +152,7 @@ class WindowBatcher:
         batch["action"] = self._take(self._action, labels)
         batch["executed"] = self._take(self._executed, labels)
         batch["present"] = self._own(present)
-        batch["valid"] = self._own(inside & (before == 0))
-        batch["perturbations"] = self._own(np.where(inside, before, -1))
+        batch["valid"] = self._own(valid)
         batch["unperturbed"] = self._own(self._perturbations[labels[:, :, -1]] == self._perturbations[frames])
         batch["instruction"] = [self._instructions[number] for number in episode.tolist()]
         return batch

@@ -136,13 +136,11 @@ class DenoisingModel(ContextModel):
         uniform = torch.rand(len(action), generator=generator).to(action)
         noisy, time, target = self.corrupt(action, noise, uniform)
         counted = batch["valid"][:, -1].repeat(self.copies, 1)
-        if self.prefix:  # reactions to what was executed are predictable, however perturbed it was
+        if self.prefix:
             executed = self.scaled(batch["executed"][:, -1]).repeat(self.copies, 1, 1)
             length = torch.randint(self.prefix + 1, (len(action),), generator=generator).to(time.device)
             noisy, time = with_prefix(noisy, time, executed, length)
-            before = batch["perturbations"][:, -1].repeat(self.copies, 1)
-            counted = (before >= 0) & (before == before.gather(1, length.unsqueeze(1)))
-            counted &= torch.arange(self.chunk, device=time.device) >= length.unsqueeze(1)
+            counted = counted & (torch.arange(self.chunk, device=time.device) >= length.unsqueeze(1))
         error = (self.denoiser(noisy, time, context, padding).float() - target).square()
         return {"action_loss": mean_where(error.mean(-1), counted)}
 
