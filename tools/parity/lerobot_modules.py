@@ -1,7 +1,7 @@
 """Imports LeRobot's own policies and processors without most of what LeRobot depends on.
 
-LeRobot is installed with `--no-deps` in a folder of its own, which is in PYTHONPATH. Libraries that are missing, such as
-those of datasets and robots, are replaced by placeholders: whatever uses one of them fails.
+LeRobot is installed with `--no-deps` in a folder of its own, which is in PYTHONPATH. After this import its policies can
+be imported: libraries that they do not need, such as those of datasets and robots, are replaced by placeholders.
 """
 
 from __future__ import annotations
@@ -16,7 +16,19 @@ from types import ModuleType
 from typing import Any
 
 # What LeRobot imports, and nothing compared here calls.
-LIBRARIES = ("accelerate", "av", "cv2", "datasets", "deepdiff", "einops", "gymnasium", "imageio", "jsonlines", "serial")
+LIBRARIES = (
+    "accelerate",
+    "av",
+    "cv2",
+    "datasets",
+    "deepdiff",
+    "einops",
+    "gymnasium",
+    "imageio",
+    "jsonlines",
+    "peft",
+    "serial",
+)
 PARTS = ("lerobot.configs.train", "lerobot.datasets", "lerobot.envs", "lerobot.robots", "lerobot.teleoperators")
 
 
@@ -51,11 +63,13 @@ class _Finder(MetaPathFinder, Loader):
         pass
 
 
-def prepare() -> None:
-    """Make `import lerobot.policies…` possible."""
+def _prepare() -> None:
     root = importlib.util.find_spec("lerobot")
     assert root is not None and root.submodule_search_locations, "LeRobot is not in PYTHONPATH: make parity"
     sys.meta_path.insert(0, _Finder())
     policies = ModuleType("lerobot.policies")  # without its __init__, which imports every policy
     policies.__path__ = [str(Path(root.submodule_search_locations[0]) / "policies")]
     sys.modules["lerobot.policies"] = policies
+
+
+_prepare()
