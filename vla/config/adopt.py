@@ -22,6 +22,7 @@ from vla.io.documents import read_yaml, resolved
 from vla.io.errors import UserError
 from vla.models.checkpoint import read_header
 from vla.models.policy_folder import POLICY, REQUIRED_NODES, is_gone, read_policy
+from vla.models.trunk_folder import is_trunk
 
 LAST = Path("checkpoints/last.ckpt")  # in the folder of a training
 # How a policy was trained, beside task, tokenizer and model: what rounds continue, and what a report on it shows.
@@ -68,6 +69,8 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
             f"pretrained={cfg.pretrained} initialises a new training: use it with job=train, evaluate or improve, and "
             "without checkpoint=, which evaluates a policy"
         )
+    if is_trunk(cfg.pretrained):
+        return _with_trunk(cfg)
     parsed = _parsed(overrides, ("tokenizer", "model", "experiment"))
     own = Path(cfg.output) / LAST  # of this training; `pretrained` may have been deleted since
     gone = own.exists() and is_gone(cfg.pretrained)
@@ -79,6 +82,21 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     if "seed" in values.get("data", {}):
         values["data"] = {**values["data"], "seed": "${seed}"}  # of this training: it orders the windows
     return _on_top(cfg, values | _chosen(saved, "model"), parsed)
+
+
+def _with_trunk(cfg: DictConfig) -> DictConfig:
+    """Return `cfg` with the weights of a policy or a vision-language model that others published as `model.trunk`.
+
+    Raises:
+        UserError: the chosen model has no trunk.
+    """
+    if "trunk" not in cfg.model:
+        raise UserError(
+            f"pretrained={cfg.pretrained} has weights of another project: say of which model, as in model=smolvla"
+        )
+    adopted = copy.deepcopy(cfg)
+    adopted.model.trunk, adopted.pretrained = cfg.pretrained, None
+    return adopted
 
 
 def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:

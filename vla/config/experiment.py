@@ -358,7 +358,8 @@ def _model(nodes: Node, spec: Spec, saved: SavedPolicy | None = None, weights: b
 
 
 def _without_weights(model: Node) -> Node:
-    """Return a model node without the initial weights of its image encoders, which lie in the policy."""
+    """Return a model node without its initial weights, or those of its image encoders, which lie in the policy."""
     nodes = {name: node for name, node in model.items() if isinstance(node, dict)}
     parts = {name: _without_weights(node) for name, node in nodes.items() if name in ("image", "context")}
-    return model | parts | ({"pretrained": False} if "pretrained" in model else {})
+    none = {"pretrained": False, "trunk": None}
+    return model | parts | {name: value for name, value in none.items() if name in model}

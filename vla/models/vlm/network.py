@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from torch import Tensor, nn
 
@@ -36,9 +36,15 @@ class FlowNetwork(nn.Module, ABC):
     pretrained: ClassVar[tuple[tuple[str, str], ...]] = ()
     unused: ClassVar[tuple[str, ...]] = ()  # beginnings of published names that no action depends on
 
+    kind: ClassVar[str] = ""  # LeRobot's name of the policy
+
     resolution: int  # height and width of an image [px]
     state_width: int  # S, padded with zeros; 0: the state is part of the sentence
     action_width: int  # A, padded with zeros
+
+    def options(self) -> dict[str, Any]:
+        """Return the options by which LeRobot describes this network, as far as they are not its defaults."""
+        return {}
 
     @abstractmethod
     def prefix(self, images: Tensor, cameras: Tensor, tokens: Tensor, sentence: Tensor, state: Tensor | None) -> Prefix:

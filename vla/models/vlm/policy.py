@@ -85,17 +85,15 @@ class VisionLanguageAction(Model):
         widths = {"text_width": 1, "width": 1, "auxiliary": 0.0}
         super().__init__(text, chunk=chunk, execute=execute, shift=shift, spec=spec, tokenizer=tokenizer, **widths)
         self.steps, self.copies, self.place, self.statistics = steps, copies, place, statistics
-        self.trunk = None if trunk is None else Trunk(trunk)
-        self.cameras = _cameras(cameras, spec, self.trunk)
-        self.network = network() if self.trunk is None else self.trunk.build(network)
+        origin = None if trunk is None else Trunk(trunk)
+        self.cameras = _cameras(cameras, spec, origin)
+        self.network = network() if origin is None else origin.build(network)
         _require_width("state", len(spec.pose), self.network.state_width or len(spec.pose))
         _require_width("action", len(spec.action), self.network.action_width)
         self.state_normalizer = Normalizer(normalization, len(spec.pose))
         self.action_normalizer = Normalizer(normalization, len(spec.action))
-        if statistics == "pretrained":
-            if self.trunk is None:
-                raise UserError("model.statistics=pretrained needs a pretrained policy, model.trunk=…")
-            known = self.trunk.statistics()
+        if statistics == "pretrained" and origin:
+            known = origin.statistics()
             self.state_normalizer.take(known, "observation.state", trunk)
             self.action_normalizer.take(known, "action", trunk)
         size = (chunk, self.network.action_width)
@@ -204,20 +202,19 @@ def _cameras(named: dict[str, str | None] | None, spec: Spec, trunk: Trunk | Non
     Raises:
         UserError: one is unknown, or one of the pretrained policy has no counterpart.
     """
-    known = trunk.cameras if trunk else ()
+    seen, ours = trunk.cameras if trunk else [], ", ".join(spec.cameras)
     if named is None:
-        if known and set(known) != {*spec.cameras}:
+        if seen and seen != [*spec.cameras]:
             raise UserError(
-                f"{trunk} sees the cameras {', '.join(known)}, and the demonstrations have {', '.join(spec.cameras)}: "
-                f"say which is which, as in 'model.cameras={{{known[0]}: {spec.cameras[0]}, …}}', null for none"
+                f"{trunk} sees {', '.join(seen)}, and the demonstrations have {ours}: say which is which, null for "
+                f"none, as in 'model.cameras={{{seen[0]}: {spec.cameras[0]}, …}}'"
             )
-        return [*(known or spec.cameras)]
-    if known and (missing := [camera for camera in known if camera not in named]):
+        return [*spec.cameras]
+    if missing := [camera for camera in seen if camera not in named]:
         raise UserError(f"model.cameras has no counterpart of {', '.join(missing)}, which {trunk} sees: null for none")
-    order = [named[camera] for camera in known] if known else [*named.values()]
-    chosen = [camera for camera in order if camera is not None]
+    chosen = [camera for camera in named.values() if camera is not None]
     if unknown := [camera for camera in chosen if camera not in spec.cameras]:
-        raise UserError(f"model.cameras names {', '.join(unknown)}: the demonstrations have {', '.join(spec.cameras)}")
+        raise UserError(f"model.cameras names {', '.join(unknown)}, and the demonstrations have {ours}")
     if not chosen:
-        raise UserError("model.cameras names no camera of the demonstrations")
+        raise UserError(f"model.cameras names none of the cameras of the demonstrations, {ours}")
     return chosen

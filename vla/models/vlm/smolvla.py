@@ -51,6 +51,7 @@ class SmolVLA(FlowNetwork):
         UserError: sizes do not divide each other.
     """
 
+    kind = "smolvla"
     published = (
         ("model.vlm_with_expert.vlm.model.", "vlm."),
         ("model.vlm_with_expert.lm_expert.", "expert."),
@@ -88,7 +89,7 @@ class SmolVLA(FlowNetwork):
         _require_multiple("head_width", head_width, "two", 2)
         _require_multiple("expert_width", expert_width, "two", 2)
         self.resolution, self.state_width, self.action_width = resolution, state_width, action_width
-        self.head_width = head_width
+        self.head_width, self.joint_every = head_width, joint_every
         attention = {"num_attention_heads": heads, "num_key_value_heads": key_heads, "head_dim": head_width}
         shared = {**attention, "num_hidden_layers": layers, "rms_norm_eps": EPSILON}
         shared |= {"bos_token_id": None, "eos_token_id": None}

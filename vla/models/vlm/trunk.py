@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,12 @@ from torch import Tensor, nn
 
 from vla.io.documents import lines_of, read_json
 from vla.io.errors import UserError
-from vla.models.hub import fetch
+from vla.models.trunk import Source
+from vla.models.trunk_folder import CONFIG, WEIGHTS, trunk_folder
 from vla.models.vlm.network import FlowNetwork, renamed
 from vla.parallel.limits import memory
 
-HUB = "hub:"
-CONFIG, PREPROCESSOR, WEIGHTS = "config.json", "policy_preprocessor.json", "model*.safetensors"
-FILES = (CONFIG, "policy_*", WEIGHTS)
+PREPROCESSOR = "policy_preprocessor.json"
 NORMALIZER = "normalizer_processor"  # its step
 IMAGES = "observation.images."
 # Options of LeRobot's policies that change what is computed → the only value that is known here.
@@ -42,7 +40,6 @@ class Trunk:
 
     def __init__(self, name: str) -> None:
         self.name, self.folder = name, trunk_folder(name)
-        self.revision = self.folder.name if self.folder.parent.name == "snapshots" else None  # in the hub's cache
         self._config = read_json(self.folder / CONFIG, dict[str, Any])
         self.is_policy = "input_features" in self._config  # of LeRobot, and not the vision-language model alone
         for option, known in OPTIONS.items():
@@ -51,19 +48,19 @@ class Trunk:
         self._files = sorted(self.folder.glob(WEIGHTS))
         if not self._files:
             raise UserError(f"{self.folder} has no weights, {WEIGHTS}: download the model again")
-        self.loaded: frozenset[str] = frozenset()  # the names of the weights that a network has from here
 
     def __str__(self) -> str:
         return self.name
 
-    @cached_property
-    def sha256(self) -> str:
-        """SHA-256 of the weights."""
-        digest = hashlib.sha256()
+    @property
+    def source(self) -> Source:
+        """What identifies the weights."""
+        digest, revision = hashlib.sha256(), self.folder.name if self.folder.parent.name == "snapshots" else None
         for path in self._files:
             with path.open("rb") as file:
                 digest.update(hashlib.file_digest(file, "sha256").digest())
-        return digest.hexdigest()
+        size = sum(path.stat().st_size for path in self._files)
+        return Source(self.name, revision, digest.hexdigest(), size)
 
     @property
     def cameras(self) -> list[str]:
@@ -81,6 +78,8 @@ class Trunk:
 
     def build(self, network: Callable[[], FlowNetwork]) -> FlowNetwork:
         """Build a network with these weights; what a vision-language model has no weights for is random.
+
+        Parts whose weights are all from here have their `source` as an attribute.
 
         Raises:
             UserError: a weight is missing, unknown or of another shape, or they need more than the memory.
@@ -108,27 +107,13 @@ class Trunk:
         if missing := [name for name in own if name not in found and name.startswith(parts)]:
             raise UserError(f"{self} lacks {missing[0]} and {len(missing) - 1} other weights of the model")
         built.load_state_dict(found, strict=False, assign=True)
-        self.loaded = frozenset(found)
         materialize(built)
+        source: Any = self.source
+        for part, module in built.named_modules():
+            names = [f"{part}.{name}".removeprefix(".") for name, _ in module.named_parameters()]
+            if names and found.keys() >= {*names}:
+                module.source = source
         return built
-
-
-def trunk_folder(name: str) -> Path:
-    """Return the folder of pretrained weights, downloading what is not cached; a UserError if there is none."""
-    if not name.startswith(HUB):
-        if not (Path(name) / CONFIG).is_file():
-            raise UserError(
-                f"model.trunk={name} is no folder with pretrained weights, it has no {CONFIG}; on the hub: hub:…"
-            )
-        return Path(name)
-    repository, _, revision = name.removeprefix(HUB).partition("@")
-    try:
-        return fetch(repository, *FILES, revision=revision or None)
-    except OSError as error:
-        raise UserError(
-            f"{name} cannot be fetched from the Hugging Face hub ({error}): give the folder of a download, or random "
-            "weights with model.trunk=null"
-        ) from error
 
 
 def materialize(network: nn.Module) -> None:

@@ -1,0 +1,300 @@
+"""Vision-language-action models: as others compute them, as others published them, and as any other model here."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from command_line import SMALL, here
+from fake_batch import as_policy, make_batch, overfit, with_text
+from safetensors.torch import load_file, save_file
+from tiny_vla import (
+    CHUNK,
+    REFERENCE,
+    SENTENCES,
+    SMOLVLA,
+    SPEC,
+    deviation,
+    fill,
+    inputs,
+    make_smolvla,
+    network_results,
+    observation,
+    published,
+    reference,
+    steps,
+    write_tokenizer,
+)
+
+from vla.config.compose import compose
+from vla.io.errors import UserError
+from vla.models.vlm.lerobot_export import LeRobotPolicyExporter
+from vla.models.vlm.network import renamed
+from vla.models.vlm.normalizer import Normalizer
+from vla.models.vlm.policy import resize_with_padding
+from vla.models.vlm.prompt import PADDING, Prompt
+from vla.models.vlm.smolvla import SmolVLA
+
+TOLERANCE = 1e-5
+
+
+@pytest.fixture(scope="module")
+def tokenizer(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tokenizer")
+    write_tokenizer(folder)
+    return folder
+
+
+def test_losses_gradients_and_every_step_are_those_of_lerobot() -> None:
+    network = SmolVLA(**SMOLVLA).eval()
+    fill(published(network))
+    ours, theirs = network_results(network, inputs(SMOLVLA)), reference("smolvla")
+    for name, value in ours.items():
+        assert deviation(value, theirs[name]) <= TOLERANCE, name
+
+
+def test_the_way_from_an_observation_to_executed_actions_is_that_of_lerobot(tokenizer: Path) -> None:
+    model, theirs = make_smolvla(tokenizer), reference("smolvla")
+    seen = observation(0)
+    frames = torch.stack([torch.from_numpy(seen.rgb[camera]) for camera in SPEC.cameras])
+    assert deviation(model.image(frames), theirs["way.images"]) <= TOLERANCE
+    state = model.state_normalizer(torch.from_numpy(seen.state))
+    assert deviation(state, theirs["way.state"][0, : len(state)]) <= TOLERANCE
+    assert not theirs["way.state"][0, len(state) :].any()
+    assert (
+        deviation(model.padded(torch.from_numpy(steps(len(SPEC.action))[:CHUNK])), theirs["way.actions"]) <= TOLERANCE
+    )
+    assert torch.equal(model.text.tokenize([*SENTENCES]), theirs["way.tokens"])
+    model.sample_noise = lambda random: theirs["policy.noise"]  # type: ignore[method-assign]
+    policy = as_policy(model, SPEC)
+    acted = [torch.from_numpy(policy.act(observation(number))) for number in range(len(theirs["policy.actions"]))]
+    assert deviation(torch.stack(acted), theirs["policy.actions"]) <= TOLERANCE
+
+
+def test_a_missing_camera_and_padding_have_no_effect() -> None:
+    network, given = SmolVLA(**SMOLVLA).eval(), inputs(SMOLVLA)
+    fill(published(network))
+    names = ("images", "cameras", "tokens", "sentence", "state")
+    whole = network.prefix(*(given[name][1:] for name in names))
+    cut = {name: given[name][1:] for name in names}
+    cut |= {name: cut[name][:, :1] for name in ("images", "cameras")}
+    cut |= {name: cut[name][:, : int(cut["sentence"].sum())] for name in ("tokens", "sentence")}
+    with torch.no_grad():
+        noisy, time = given["noise"][1:], given["time"][1:]
+        velocity = network.velocity(whole, noisy, time)
+        assert deviation(network.velocity(network.prefix(*(cut[name] for name in names)), noisy, time), velocity) < 1e-5
+        # A time for every action, and no action sees a later one.
+        each = time[:, None].repeat(1, CHUNK)
+        assert torch.equal(network.velocity(whole, noisy, each), velocity)
+        later = torch.cat([noisy[:, :-1], noisy[:, -1:] + 1], 1)
+        assert torch.equal(network.velocity(whole, later, time)[:, :-1], velocity[:, :-1])
+
+
+def test_published_names_and_shapes_are_those_of_the_network() -> None:
+    listed = json.loads((REFERENCE / "smolvla_base.json").read_text())
+    shapes = dict[str, list[int]]()
+    for name, layers, shape in listed["weights"]:
+        for number in range(*map(int, layers.split(":"))) if layers else [0]:
+            shapes[name.replace("*", str(number))] = shape
+    assert len(shapes) == listed["tensors"] and sum(map(math.prod, shapes.values())) == listed["numbers"]
+    arguments = {name: value for name, value in compose("model=smolvla").model.network.items() if name[0] != "_"}
+    with torch.device("meta"):
+        network = SmolVLA(**arguments)
+    ours = {name: [*weight.shape] for name, weight in network.named_parameters()}
+    used = {name: shape for name, shape in shapes.items() if not name.startswith(network.unused)}
+    assert {renamed(name, network.published): shape for name, shape in used.items()} == ours
+    assert shapes.keys() - used.keys() == {"model.vlm_with_expert.vlm.lm_head.weight"}
+
+
+@pytest.mark.parametrize("kind", ["mean_std", "quantiles"])
+def test_normalisation_is_invertible_and_by_the_statistics_of_the_data(kind: Any) -> None:
+    normalizer, data = Normalizer(kind, 3), steps(3)
+    normalizer.fit(data)
+    scaled = normalizer(torch.from_numpy(data))
+    if kind == "mean_std":
+        assert torch.allclose(scaled.mean(0), torch.zeros(3), atol=1e-5)
+        assert torch.allclose(scaled.std(0, correction=0), torch.ones(3), atol=1e-5)
+    else:
+        assert torch.allclose(scaled.quantile(0.01, 0), -torch.ones(3), atol=1e-5)
+        assert torch.allclose(scaled.quantile(0.99, 0), torch.ones(3), atol=1e-5)
+    assert torch.allclose(normalizer.inverse(scaled), torch.from_numpy(data), atol=1e-5)
+
+
+def test_images_of_another_aspect_ratio_lie_in_the_corner_or_in_the_centre() -> None:
+    image = torch.ones(1, 3, 20, 40)
+    corner, centre = (resize_with_padding(image, 8, place)[0, 0, :, 0] for place in ("corner", "centre"))
+    assert corner.tolist() == [0, 0, 0, 0, 1, 1, 1, 1] and centre.tolist() == [0, 0, 1, 1, 1, 1, 0, 0]
+
+
+def test_the_state_is_read_as_numbers_within_the_prompt(tokenizer: Path) -> None:
+    for name in (str(tokenizer), None):
+        prompt = Prompt(name, 90, state=True)
+        state = torch.tensor([[-1.5, -1.0, 0.0, 0.999], [0.5, 0.25, -0.2, 2.0]])
+        tokens = prompt(prompt.tokenize(["lift_it\n", "put the block away"]), state)
+        # Bins as openpi computes them.
+        numbers = np.digitize(state.numpy(), np.linspace(-1, 1, 257)[:-1]) - 1
+        texts = [
+            f"Task: {task}, State: {' '.join(map(str, row))};\nAction: "
+            for task, row in zip(["lift it", "put the block away"], numbers, strict=True)
+        ]
+        rows = [prompt._ids(text, special=True) for text in texts]
+        assert [row[row != PADDING].tolist() for row in tokens] == rows
+        assert tokens.shape == (2, 90)
+
+
+def test_a_model_overfits_saves_and_ignores_truth() -> None:
+    torch.manual_seed(0)
+    model = make_smolvla(copies=4)
+    model.train()
+    batch = with_text(model, make_batch(1, CHUNK, spec=SPEC))
+    batch["action"] = batch["action"] / 9  # about the statistics of the data
+    before = overfit(model, batch, 1)
+    assert overfit(model.train(), batch, 120) < 0.4 * before
+    other = make_smolvla()
+    other.load_state_dict(model.state_dict())
+    del batch["truth"]
+    with torch.inference_mode():
+        assert torch.equal(other.predict(batch).actions, model.predict(batch).actions)
+
+
+def written(folder: Path, tokenizer: Path, change: Callable[[dict[str, Any]], None] | None = None) -> Path:
+    """A published policy of random weights."""
+    model = make_smolvla(tokenizer)
+    LeRobotPolicyExporter(folder).export_policy(as_policy(model, SPEC))
+    if change:
+        path = folder / "model.safetensors"
+        weights = load_file(path)
+        change(weights)
+        save_file(weights, path)
+    return folder
+
+
+def test_published_weights_and_statistics_are_loaded(tmp_path: Path, tokenizer: Path) -> None:
+    def as_bfloat16(weights: dict[str, Any]) -> None:
+        name = "model.vlm_with_expert.vlm.lm_head.weight"  # which is published, and no action depends on it
+        weights[name] = torch.zeros(3, 4)
+        for key in weights:
+            weights[key] = weights[key].bfloat16().float() if "norm" in key else weights[key]
+
+    folder = written(tmp_path / "published", tokenizer, as_bfloat16)
+    cameras = {"front": "wrist", "wrist": "front"}
+    model = make_smolvla(tokenizer, trunk=str(folder), statistics="pretrained", cameras=cameras)
+    assert model.cameras == ["wrist", "front"]
+    ours, theirs = make_smolvla(tokenizer), load_file(folder / "model.safetensors")
+    loaded = {f"model.{name}": weight for name, weight in published(model.network)}
+    assert loaded.keys() == theirs.keys() - {"model.vlm_with_expert.vlm.lm_head.weight"}
+    assert all(torch.equal(weight, theirs[name]) for name, weight in loaded.items())
+    assert torch.equal(model.action_normalizer.std, ours.action_normalizer.std)
+    assert isinstance(model.network, SmolVLA) and str(model.network.vlm.source).startswith(str(folder))
+    model.fit(steps(4) + 5, steps(3) + 5)  # which are not asked for
+    assert torch.equal(model.action_normalizer.mean, ours.action_normalizer.mean)
+
+
+def test_a_trunk_alone_leaves_the_expert_random(tmp_path: Path, tokenizer: Path) -> None:
+    folder = tmp_path / "trunk"
+    folder.mkdir()
+    (folder / "config.json").write_text('{"model_type": "smolvlm"}')
+    state = make_smolvla().network.state_dict().items()
+    weights = {f"model.{name.removeprefix('vlm.')}": weight for name, weight in state if name.startswith("vlm.")}
+    further = {"model.text_model.layers.31.mlp.up_proj.weight": torch.zeros(2), "lm_head.weight": torch.zeros(2)}
+    save_file({**weights, **further}, folder / "model.safetensors")
+    torch.manual_seed(0)
+    model = make_smolvla(trunk=str(folder))
+    found = model.network.state_dict()
+    assert all(torch.equal(found[name.replace("model.", "vlm.", 1)], weight) for name, weight in weights.items())
+    norms, maps = (found[f"expert.layers.1.{name}.weight"] for name in ("input_layernorm", "self_attn.k_proj"))
+    assert torch.equal(norms, torch.ones_like(norms)) and 0.015 < maps.std() < 0.025
+    assert not hasattr(model.network.expert, "source") and hasattr(model.network.vlm, "source")
+    with torch.inference_mode():
+        assert model.predict(with_text(model, make_batch(1, CHUNK, spec=SPEC))).actions.isfinite().all()
+
+
+def _drop(weights: dict[str, Any]) -> None:
+    del weights["model.state_proj.bias"]
+
+
+def _add(weights: dict[str, Any]) -> None:
+    weights["model.other.bias"] = torch.zeros(1)
+
+
+def _resize(weights: dict[str, Any]) -> None:
+    weights["model.state_proj.bias"] = torch.zeros(5)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (_drop, "lacks state_proj.bias"),
+        (_add, "has a weight that the model lacks, model.other.bias"),
+        (_resize, "model.state_proj.bias in .* has the shape"),
+    ],
+)
+def test_other_weights_are_refused(tmp_path: Path, tokenizer: Path, change: Any, sentence: str) -> None:
+    folder = written(tmp_path / "published", tokenizer, change)
+    with pytest.raises(UserError, match=sentence):
+        make_smolvla(tokenizer, trunk=str(folder))
+
+
+def test_a_normaliser_without_the_action_and_a_camera_without_counterpart_are_refused(
+    tmp_path: Path, tokenizer: Path
+) -> None:
+    folder = written(tmp_path / "published", tokenizer)
+    path = folder / "policy_preprocessor_step_5_normalizer_processor.safetensors"
+    statistics = load_file(path)
+    save_file({f"so100.buffer.{name}": value for name, value in statistics.items()}, path)  # as in smolvla_base
+    with pytest.raises(UserError, match=r"has no observation\.state\.mean"):
+        make_smolvla(tokenizer, trunk=str(folder), statistics="pretrained")
+    save_file({name: value for name, value in statistics.items() if "action" not in name}, path)
+    with pytest.raises(UserError, match=r"has no action\.mean, so what it says of action cannot be put into units"):
+        make_smolvla(tokenizer, trunk=str(folder), statistics="pretrained")
+    make_smolvla(tokenizer, trunk=str(folder))  # by the demonstrations
+    config = json.loads((folder / "config.json").read_text())
+    names = {"observation.images.wrist": "observation.images.third"}
+    config["input_features"] = {names.get(name, name): value for name, value in config["input_features"].items()}
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match="sees front, third, and the demonstrations have front, wrist"):
+        make_smolvla(tokenizer, trunk=str(folder))
+    with pytest.raises(UserError, match="no counterpart of third"):
+        make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "front"})
+    with pytest.raises(UserError, match="names top, and the demonstrations have front, wrist"):
+        make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "front", "third": "top"})
+    one = make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "wrist", "third": None})
+    assert one.cameras == ["wrist"]
+
+
+def test_a_trunk_that_is_not_there_and_a_tokenizer_that_is_not_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="is no folder with pretrained weights"):
+        make_smolvla(trunk=str(tmp_path / "nothing"))
+    with pytest.raises(UserError, match="cannot be fetched from the Hugging Face hub"):
+        make_smolvla(trunk="hub:nobody/nothing")
+    with pytest.raises(UserError, match="cannot be fetched from the Hugging Face hub"):
+        make_smolvla(tmp_path / "nothing")
+    (tmp_path / "tokenizer.json").write_text("{}")
+    with pytest.raises(UserError, match="is no tokenizer"):
+        make_smolvla(tmp_path)
+
+
+def test_a_published_policy_is_fine_tuned_and_evaluated_from_the_command_line(home: Path) -> None:
+    write_tokenizer(home / "tokenizer")
+    small = ("vision_layers=1", "layers=2", "resolution=24", "vocabulary=320", "vision_width=32", "vision_heads=1")
+    sizes = [f"model.network.{each}" for each in small]
+    tiny = [*SMALL, "model=smolvla_tiny", "model.text.name=tokenizer", "trainer.max_steps=2", *sizes]
+    here(home, *tiny, "job=train", "output=first", "hydra.run.dir=first")
+    to = ["export=lerobot_policy", "export.folder=published"]
+    here(home, "job=export", "checkpoint=first", *to, "output=exported", "hydra.run.dir=exported")
+    refused = here(home, *SMALL, "pretrained=published", "job=train", "output=bc", "hydra.run.dir=bc", ok=False)
+    assert "as in model=smolvla" in refused.stderr
+    frozen = ["pretrained=published", "learner.frozen=[network.vlm]", "output=second", "hydra.run.dir=second"]
+    here(home, *tiny, *frozen, "evaluate.episodes=1")
+    published, tuned = (load_file(home / name / "model.safetensors") for name in ("published", "second/policy"))
+    name = "connector.modality_projection.proj.weight"
+    theirs, ours = published[f"model.vlm_with_expert.vlm.model.{name}"], tuned.get(f"network.vlm.{name}")
+    assert ours is None or torch.equal(theirs, ours)
+    assert not torch.equal(published["model.state_proj.weight"], tuned["network.state_proj.weight"])
+    assert json.loads((home / "second/policy/config.json").read_text())["model"]["trunk"] == "published"

@@ -1,0 +1,97 @@
+"""Pretrained parts of a model that stay where they are: a policy names them, and holds what was trained beside them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import StringConstraints
+from torch import nn
+
+from vla.io.documents import STRICT
+from vla.io.errors import UserError
+from vla.io.types import Natural, Text
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the weights of a part come from; who loads them sets it as the attribute `source` of the module."""
+
+    __pydantic_config__ = STRICT
+
+    name: Text  # package, file or folder, or repository of the hub
+    revision: str | None  # commit of the hub
+    sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]  # of the file
+    size: Natural  # of the file [bytes]
+
+    @classmethod
+    def of(cls, path: Path, name: str) -> Source:
+        """Return the source of weights that were read from a file, which may lie in the hub's cache."""
+        folder = path.absolute().parent
+        revision = folder.name if folder.parent.name == "snapshots" else None
+        with path.open("rb") as file:
+            return cls(name, revision, hashlib.file_digest(file, "sha256").hexdigest(), path.stat().st_size)
+
+    def __str__(self) -> str:
+        return f"{self.name}{f' at {self.revision}' if self.revision else ''}, SHA-256 {self.sha256[:8]}…"
+
+
+def is_within(name: str, parts: Collection[str]) -> bool:
+    """Return whether the dotted name of a weight is in one of the parts."""
+    return any(f"{name}.".startswith(f"{part}.") for part in parts)
+
+
+def is_factor(name: str) -> bool:
+    """Return whether a weight is a factor of LoRA, which is trained also in a frozen part."""
+    return ".lora_" in name
+
+
+def trunks(model: nn.Module) -> dict[str, Source]:
+    """Return name → source of the parts whose weights came from somewhere else and are not trained."""
+    found = dict[str, Source]()
+    for name, module in model.named_modules():
+        source = getattr(module, "source", None)
+        trained = any(weight.requires_grad and not is_factor(each) for each, weight in module.named_parameters())
+        if isinstance(source, Source) and not trained and not is_within(name, found):
+            found[name] = source
+    return found
+
+
+def evaluate_trunk(module: nn.Module) -> None:
+    """Put a trunk into evaluation mode, in which nothing in it changes; dropout before factors of LoRA goes on."""
+    module.eval()
+    for name, part in module.named_modules():
+        part.train(is_factor(f"{name}."))
+
+
+def require_trunks(model: nn.Module, named: Mapping[str, Source], policy: object) -> None:
+    """Require the trunks that a policy names; a module that does not load its own when it is built has `load_source`.
+
+    Raises:
+        UserError: one is not here, or is another one than in training.
+    """
+    modules: dict[str, Any] = dict(model.named_modules())
+    for part, source in named.items():
+        module = modules.get(part)
+        if not hasattr(module, "source") and hasattr(module, "load_source"):
+            module.load_source(source)
+        if (found := getattr(module, "source", None)) is None or found.sha256 != source.sha256:
+            here = f"here it is {found}" if found else "that is not here"
+            raise UserError(f"{policy} was trained with {part} from {source}, and {here}: get that revision")
+
+
+def whole_state(model: nn.Module, state: Mapping[str, Any], named: Collection[str]) -> dict[str, Any]:
+    """Return the state of a policy with that of the trunks it names, to which their factors of LoRA are added."""
+    whole = {name: value for name, value in state.items() if not (is_factor(name) and is_within(name, named))}
+    for part in named:
+        module: Any = model.get_submodule(part)
+        for name, value in module.state_dict(prefix=f"{part}.").items():
+            layer = name.removesuffix(".weight")
+            if f"{layer}.lora_A" in state:
+                value = value + state[f"{layer}.lora_B"] @ state[f"{layer}.lora_A"]
+                module.source = None  # it is no longer what came from there
+            whole[name] = value
+    return whole

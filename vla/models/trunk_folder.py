@@ -1,0 +1,49 @@
+"""Folders of weights that others published, here or on the hub."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from vla.io.documents import read_json
+from vla.io.errors import UserError
+from vla.models.hub import fetch
+
+HUB = "hub:"
+CONFIG, WEIGHTS = "config.json", "model*.safetensors"
+FILES = (CONFIG, "policy_*", WEIGHTS)
+OF_OTHERS = {"model_type", "input_features"}  # in the config of transformers, and of a policy of LeRobot
+
+
+def is_trunk(name: str) -> bool:
+    """Return whether `name` is a folder of weights that others published, or names it on the hub.
+
+    Raises:
+        UserError: the hub cannot be reached.
+    """
+    if name.startswith(HUB) and "@" not in name:
+        return True  # a policy of this project is named with its revision
+    path = (_fetched(name, CONFIG) if name.startswith(HUB) else Path(name)) / CONFIG
+    return path.is_file() and not OF_OTHERS.isdisjoint(read_json(path, dict[str, Any]))
+
+
+def trunk_folder(name: str) -> Path:
+    """Return the folder of pretrained weights, downloading what is not cached; a UserError if there is none."""
+    if not name.startswith(HUB):
+        if not (Path(name) / CONFIG).is_file():
+            raise UserError(
+                f"model.trunk={name} is no folder with pretrained weights, it has no {CONFIG}; on the hub: hub:…"
+            )
+        return Path(name)
+    return _fetched(name, *FILES)
+
+
+def _fetched(name: str, *patterns: str) -> Path:
+    repository, _, revision = name.removeprefix(HUB).partition("@")
+    try:
+        return fetch(repository, *patterns, revision=revision or None)
+    except OSError as error:
+        raise UserError(
+            f"{name} cannot be fetched from the Hugging Face hub ({error}): give the folder of a download, or random "
+            "weights with model.trunk=null"
+        ) from error

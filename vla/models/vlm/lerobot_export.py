@@ -1,0 +1,134 @@
+"""Vision-language-action models as folders that LeRobot's own classes load."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from vla.io.errors import UserError
+from vla.io.files import atomic_path, write_json
+from vla.io.types import Text
+from vla.models.trunk_folder import CONFIG
+from vla.models.vlm.network import renamed
+from vla.models.vlm.normalizer import EPSILON, Normalizer
+from vla.models.vlm.policy import VisionLanguageAction
+from vla.models.vlm.prompt import Prompt
+from vla.models.vlm.trunk import IMAGES, NORMALIZER, PREPROCESSOR
+
+POSTPROCESSOR = "policy_postprocessor.json"
+STATE, ACTION = "observation.state", "action"
+MODES = {"mean_std": "MEAN_STD", "quantiles": "QUANTILES"}
+
+
+class LeRobotPolicyExporter:
+    """Writes a trained policy in LeRobot's layout: config.json, model.safetensors, and its processors with statistics.
+
+    The state has the components that the model uses, which are no rates. The folder is written atomically.
+
+    Args:
+        folder: output folder, which must not exist.
+    """
+
+    def __init__(self, folder: Text | Path) -> None:
+        self._folder = Path(folder).resolve()
+
+    def export_policy(self, policy: Any) -> Path:
+        """Write a policy; returns the folder.
+
+        Raises:
+            UserError: the folder exists, or the policy is no vision-language-action model.
+        """
+        from safetensors.torch import save_file
+
+        if self._folder.exists():
+            raise UserError(f"{self._folder} exists already: choose another export.folder")
+        model = policy.model
+        if not isinstance(model, VisionLanguageAction):
+            raise UserError(f"LeRobot has no {type(model).__name__}: this export is of model=smolvla, pi0 and pi05")
+        beginnings = [(ours, theirs) for theirs, ours in model.network.published]
+        state = model.network.state_dict()
+        weights = {renamed(name, beginnings): tensor.detach().cpu().contiguous() for name, tensor in state.items()}
+        steps = _preprocessing(model), _postprocessing(model)
+        with atomic_path(self._folder) as draft:
+            draft.mkdir(parents=True)
+            save_file(weights, draft / "model.safetensors")
+            write_json(draft / CONFIG, _config(model))
+            for file, pipeline in zip((PREPROCESSOR, POSTPROCESSOR), steps, strict=True):
+                for step in pipeline:
+                    if "state_file" in step:
+                        save_file(_statistics(model), draft / step["state_file"])
+                write_json(draft / file, {"name": file.removesuffix(".json"), "steps": pipeline})
+        return self._folder
+
+
+def _config(model: VisionLanguageAction) -> dict[str, Any]:
+    inputs, outputs = _features(model)
+    network, mode = model.network, MODES[model.action_normalizer.kind]
+    trunk = {"vlm_model_name": _prompt(model).name} if network.kind == "smolvla" else {}
+    return {
+        "type": network.kind,
+        "input_features": inputs,
+        "output_features": outputs,
+        "chunk_size": model.chunk,
+        "n_action_steps": model.execute,
+        "normalization_mapping": {"VISUAL": "IDENTITY", "STATE": mode, "ACTION": mode},
+        "max_state_dim": network.state_width or network.action_width,
+        "max_action_dim": network.action_width,
+        "tokenizer_max_length": _prompt(model).length,
+        **network.options(),
+        **trunk,
+    }
+
+
+def _features(model: VisionLanguageAction) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return LeRobot's descriptions of inputs and outputs."""
+    image = {"type": "VISUAL", "shape": [3, *model.spec.image_size]}
+    state = {STATE: {"type": "STATE", "shape": [len(model.spec.pose)]}}
+    images = {f"{IMAGES}{camera}": image for camera in model.cameras}
+    return {**state, **images}, {ACTION: {"type": "ACTION", "shape": [len(model.spec.action)]}}
+
+
+def _preprocessing(model: VisionLanguageAction) -> list[dict[str, Any]]:
+    prompt = _prompt(model)
+    tokens = {"max_length": prompt.length, "task_key": "task", "padding_side": "right", "padding": "max_length"}
+    inputs, outputs = _features(model)
+    normalizer = _step(NORMALIZER, model, {**inputs, **outputs}, "policy_preprocessor_step_5_normalizer_processor")
+    return [
+        {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}},
+        {"registry_name": "to_batch_processor", "config": {}},
+        {"registry_name": f"{model.network.kind}_new_line_processor", "config": {}},
+        {
+            "registry_name": "tokenizer_processor",
+            "config": {**tokens, "truncation": True, "tokenizer_name": prompt.name},
+        },
+        {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}},
+        normalizer,
+    ]
+
+
+def _postprocessing(model: VisionLanguageAction) -> list[dict[str, Any]]:
+    file = "policy_postprocessor_step_0_unnormalizer_processor"
+    step = _step("unnormalizer_processor", model, _features(model)[1], file)
+    return [step, {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}}]
+
+
+def _step(name: str, model: VisionLanguageAction, features: dict[str, Any], file: str) -> dict[str, Any]:
+    mode = MODES[model.action_normalizer.kind]
+    config = {"eps": EPSILON, "features": features, "norm_map": {"VISUAL": "IDENTITY", "STATE": mode, "ACTION": mode}}
+    return {"registry_name": name, "config": config, "state_file": f"{file}.safetensors"}
+
+
+def _statistics(model: VisionLanguageAction) -> dict[str, Tensor]:
+    parts: dict[str, Normalizer] = {STATE: model.state_normalizer, ACTION: model.action_normalizer}
+    return {
+        f"{feature}.{name}": value.detach().cpu().clone()
+        for feature, normalizer in parts.items()
+        for name, value in normalizer.state_dict().items()
+    }
+
+
+def _prompt(model: VisionLanguageAction) -> Prompt:
+    assert isinstance(model.text, Prompt)
+    return model.text
