@@ -4,34 +4,24 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tiny_pi import SIZES, STATE_WIDTH, STEPS, inputs, published_weights
-from tiny_vla import deviation, fill, reference
+from tiny_pi import KINDS, STEPS, inputs, make_network
+from tiny_vla import deviation, reference
 from torch import Tensor
 
-from vla.models.vlm.network import Prefix
-from vla.models.vlm.paligemma import PaliGemmaWithExpert
-from vla.models.vlm.pi0 import PI0
-from vla.models.vlm.pi05 import PI05
+from vla.models.vlm.network import FlowNetwork, Prefix
 
-NETWORKS = {"pi0": lambda: PI0(state_width=STATE_WIDTH, **SIZES), "pi05": lambda: PI05(**SIZES)}
 TOLERANCE = 1e-5
-each = pytest.mark.parametrize("name", NETWORKS)
+each = pytest.mark.parametrize("name", KINDS)
 
 
-def filled(name: str) -> PaliGemmaWithExpert:
-    network = NETWORKS[name]()
-    fill(published_weights(network))
-    return network
-
-
-def encoded(network: PaliGemmaWithExpert, given: dict[str, Tensor]) -> Prefix:
+def encoded(network: FlowNetwork, given: dict[str, Tensor]) -> Prefix:
     known = (given[name] for name in ("images", "cameras", "tokens", "sentence"))
     return network.prefix(*known, given["state"] if network.state_width else None)
 
 
 @each
 def test_losses_and_gradients_are_those_of_the_reference(name: str) -> None:
-    network, given, theirs = filled(name), inputs(), reference(name)
+    network, given, theirs = make_network(name), inputs(), reference(name)
     time, noise, actions = given["time"][:, None, None], given["noise"], given["actions"]
     velocity = network.velocity(encoded(network, given), time * noise + (1 - time) * actions, given["time"])
     losses = (velocity - (noise - actions)).square()
@@ -46,7 +36,7 @@ def test_losses_and_gradients_are_those_of_the_reference(name: str) -> None:
 
 @each
 def test_every_step_of_sampling_is_that_of_the_reference(name: str) -> None:
-    network, given, theirs = filled(name), inputs(), reference(name)["steps"]
+    network, given, theirs = make_network(name), inputs(), reference(name)["steps"]
     actions = given["noise"]
     assert torch.equal(actions, theirs[0])
     with torch.no_grad():
@@ -59,7 +49,7 @@ def test_every_step_of_sampling_is_that_of_the_reference(name: str) -> None:
 
 @each
 def test_what_is_absent_has_no_effect_and_what_is_present_has(name: str) -> None:
-    network, given = filled(name).eval(), inputs()
+    network, given = make_network(name), inputs()
 
     def result(**changed: Tensor) -> Tensor:
         with torch.no_grad():
@@ -74,7 +64,7 @@ def test_what_is_absent_has_no_effect_and_what_is_present_has(name: str) -> None
 
 @each
 def test_a_time_per_action_is_that_of_the_action(name: str) -> None:
-    network, given = filled(name).eval(), inputs()
+    network, given = make_network(name), inputs()
     with torch.no_grad():
         prefix = encoded(network, given)
         together = network.velocity(prefix, given["noise"], given["time"])
@@ -87,6 +77,6 @@ def test_a_time_per_action_is_that_of_the_action(name: str) -> None:
 @each
 def test_all_that_is_trained_has_a_gradient(name: str) -> None:
     """Otherwise processes of a training would wait for those of some weights."""
-    network, given = filled(name), inputs()
+    network, given = make_network(name), inputs()
     network.velocity(encoded(network, given), given["noise"], given["time"]).square().sum().backward()
     assert [name for name, weight in network.named_parameters() if weight.requires_grad and weight.grad is None] == []

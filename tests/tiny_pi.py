@@ -5,19 +5,27 @@ Shapes: B batch, C cameras, L tokens, k action chunk, A padded action, S padded 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from defaults import defaults_of, part_of
+from tiny_vla import fill, published
 from tokenizers import Tokenizer
 from tokenizers.models import BPE
 from tokenizers.normalizers import Replace
 from tokenizers.processors import TemplateProcessing
 from torch import Tensor
 
+from vla.models.tokenizers.tokenizer import Uniform
 from vla.models.vlm.network import FlowNetwork
+from vla.models.vlm.pi0 import PI0
+from vla.models.vlm.pi05 import PI05
+from vla.models.vlm.policy import VisionLanguageAction
+from vla.models.vlm.prompt import Prompt
+from vla.spec import Spec
 
 # Arguments of the networks; LeRobot's has eight heads at any size.
 SIZES: dict[str, Any] = {
@@ -27,10 +35,22 @@ SIZES: dict[str, Any] = {
 }
 STATE_WIDTH = 8  # of π0
 CHUNK, STEPS = 10, 10
-LENGTH = 64  # of a prompt of π0.5
+LENGTH = 64  # of a prompt
+KINDS: dict[str, type[FlowNetwork]] = {"pi0": PI0, "pi05": PI05}
 
 # Of the whole way from an observation to a command: state and action are narrower than what they are padded to.
-STATE, ACTION = ("x", "y", "z", "yaw", "gripper"), ("x", "y", "z", "yaw", "grip")
+COMPONENTS = ("x", "y", "z", "yaw", "gripper")
+SPEC = Spec(
+    cameras=("front", "side"),
+    image_size=(36, 48),
+    state=COMPONENTS,
+    state_units=("m", "m", "m", "rad", "m"),
+    action=COMPONENTS,
+    units=("m", "m", "m", "rad", "1"),
+    low=(-1.0,) * 5,
+    high=(1.0,) * 5,
+    control_hz=10.0,
+)
 TASKS = ("  pick_up the red\nblock ", "open the drawer")
 CHARACTERS = "\n ,.:;-_0123456789abcdefghijklmnopqrstuvwxyzATS▁"
 
@@ -87,13 +107,39 @@ def write_tokenizer(folder: Path) -> Path:
     return folder
 
 
-def published_name(network: type[FlowNetwork], name: str) -> str:
-    """Return what a published checkpoint calls a weight."""
-    there, here = next(pair for pair in network.published if name.startswith(pair[1]))
-    return there + name.removeprefix(here)
+def make_network(name: str) -> FlowNetwork:
+    """A network with the weights of `fill`."""
+    network = KINDS[name](**SIZES, **({"state_width": STATE_WIDTH} if name == "pi0" else {}))
+    fill(published(network))
+    return network.eval()
 
 
-def published_weights(network: FlowNetwork) -> Iterator[tuple[str, Tensor]]:
-    """The weights of a network under their published names, without the beginning that LeRobot gives all."""
-    for name, weight in network.state_dict().items():
-        yield published_name(type(network), name).removeprefix("model."), weight
+def make_policy(name: str, tokenizer: Path | None = None, **options: Any) -> VisionLanguageAction:
+    """The policy of an option with a tiny network of the weights of `fill`, unless a trunk gives them."""
+    text = part_of(f"model/{name}", "text", name=tokenizer and str(tokenizer), length=LENGTH)
+    return VisionLanguageAction(
+        partial(make_network, name),
+        partial(Prompt, **text),
+        **defaults_of(f"model/{name}", chunk=CHUNK, **options),
+        spec=SPEC,
+        tokenizer=Uniform(spec=SPEC, **defaults_of("tokenizer/uniform")),
+    ).eval()
+
+
+def take_statistics(model: VisionLanguageAction) -> None:
+    """Normalise by the quantiles of `observed`."""
+    given = observed()
+    for normalizer, name in ((model.state_normalizer, "state"), (model.action_normalizer, "action")):
+        normalizer.take(given, name, "the dataset")
+
+
+def batch_of(model: VisionLanguageAction) -> dict[str, Any]:
+    """What a policy is given of `observed`."""
+    given = observed()
+    return {
+        "rgb": {camera: images.unsqueeze(1) for camera, images in zip(SPEC.cameras, given["images"], strict=True)},
+        "state": given["state"].unsqueeze(1),
+        "present": torch.ones(len(TASKS), 1, dtype=torch.bool),
+        "text": model.text.tokenize([*TASKS]),
+        "noise": given["noise"],
+    }

@@ -1,25 +1,17 @@
 """Compares π0 with transformers' own, of equal weights, noise and times, and writes what the tests compare with.
 
-python tools/parity/pi0.py
+PYTHONPATH=.:tests python tools/parity/pi0.py
 """
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
+from references import write
+from tiny_pi import CHUNK, SIZES, STATE_WIDTH, STEPS, inputs, make_network
 from torch import Tensor
 from transformers import PI0Config, PI0ForConditionalGeneration
-
-sys.path.append(str(Path(__file__).parents[2] / "tests"))
-
-from tiny_pi import CHUNK, SIZES, STATE_WIDTH, STEPS, inputs, published_weights
-from tiny_vla import REFERENCE, deviation, fill
-
-from vla.models.vlm.pi0 import PI0
 
 IMAGE = SIZES["vocabulary"] - 1  # the token that stands for a patch
 GRADIENTS = (  # of the network, by its names here
@@ -27,7 +19,6 @@ GRADIENTS = (  # of the network, by its names here
     "paligemma.language_model.layers.0.self_attn.v_proj.weight",
     "expert.layers.1.mlp.down_proj.weight",
 )
-TOLERANCE = 1e-5
 
 
 def their_name(name: str) -> str:
@@ -97,19 +88,11 @@ def their_results(theirs: PI0ForConditionalGeneration, given: dict[str, Tensor])
 
 def main() -> None:
     """Write what the network of transformers computes."""
-    theirs, ours = their_network(), PI0(state_width=STATE_WIDTH, **SIZES)
-    fill(published_weights(ours))
+    theirs, ours = their_network(), make_network("pi0")
     unused = theirs.model.dit.embed_tokens.weight  # the expert reads no words
     state = {their_name(name): weight for name, weight in ours.state_dict().items()}
     theirs.load_state_dict({**state, "model.dit.embed_tokens.weight": unused})
-    results = their_results(theirs, inputs())
-    path = REFERENCE / "pi0.safetensors"
-    if path.exists():
-        from safetensors.torch import load_file
-
-        for name, stored in load_file(path).items():
-            print(name, deviation(stored, results[name]))
-    save_file(results, path)
+    write("pi0", their_results(theirs, inputs()))
 
 
 if __name__ == "__main__":

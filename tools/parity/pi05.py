@@ -6,22 +6,41 @@ LeRobot 0.6 with transformers 5.5 are in a folder of their own: PYTHONPATH=FOLDE
 
 from __future__ import annotations
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
 import lerobot_modules  # first: it makes the imports of LeRobot possible  # noqa: F401
 import newer_python  # noqa: F401
 import torch
+from fake_batch import as_policy
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.pi05 import modeling_pi05
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.pi05.processor_pi05 import make_pi05_pre_post_processors
-from lerobot.processor import tokenizer_processor
-from safetensors.torch import load_file, save_file
-from tiny_pi import CHUNK, LENGTH, SIZES, STEPS, TASKS, inputs, observed, tokenizer
-from tiny_vla import REFERENCE, deviation, fill
+from lerobot.processor import PolicyProcessorPipeline, tokenizer_processor
+from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
+from references import TOLERANCE, write
+from tiny_pi import (
+    CHUNK,
+    LENGTH,
+    SIZES,
+    SPEC,
+    STEPS,
+    TASKS,
+    inputs,
+    make_policy,
+    observed,
+    take_statistics,
+    tokenizer,
+    write_tokenizer,
+)
+from tiny_vla import deviation, fill, published
 from torch import Tensor
 from transformers import GemmaConfig, PaliGemmaConfig, PreTrainedTokenizerFast
+
+from vla.models.vlm.lerobot_export import LeRobotPolicyExporter
 
 CAMERAS = ("front", "side", "wrist")  # nobody has the last one
 GRADIENTS = {  # of the network, by its names here → LeRobot's
@@ -69,6 +88,8 @@ def their_policy() -> modeling_pi05.PI05Policy:
     )
     policy = modeling_pi05.PI05Policy(config).eval()
     fill((name.removeprefix("model."), weight) for name, weight in policy.state_dict().items())
+    trunk = policy.model.paligemma_with_expert.paligemma
+    trunk.model.language_model.embed_tokens.weight.data.copy_(trunk.lm_head.weight)  # one matrix is published as both
     return policy
 
 
@@ -98,23 +119,32 @@ def network_results(theirs: Any) -> dict[str, Tensor]:
     return {"losses": losses.detach(), "steps": torch.stack(steps), **found}
 
 
+def without_hub() -> None:
+    """Give LeRobot's processors our tokenizer in place of the hub's."""
+    reader = PreTrainedTokenizerFast(tokenizer_object=tokenizer(), pad_token="<pad>", bos_token="<bos>")
+    tokenizer_processor.AutoTokenizer = SimpleNamespace(from_pretrained=lambda name: reader)
+
+
+def raw() -> dict[str, Any]:
+    """Return the observations as LeRobot's processors take them."""
+    given = observed()
+    images = {
+        f"observation.images.{camera}": values.permute(0, 3, 1, 2).float() / 255
+        for camera, values in zip(CAMERAS, given["images"], strict=False)
+    }
+    return {**images, "observation.state": given["state"], "action": given["actions"], "task": [*TASKS]}
+
+
 def way_results(policy: modeling_pi05.PI05Policy) -> dict[str, Tensor]:
     """Return what LeRobot makes of raw observations, and the commands it makes of what the network answers."""
     given = observed()
-    reader = PreTrainedTokenizerFast(tokenizer_object=tokenizer(), pad_token="<pad>", bos_token="<bos>")
-    tokenizer_processor.AutoTokenizer = SimpleNamespace(from_pretrained=lambda name: reader)
     statistics = {
         name: {each: given[f"{name.rpartition('.')[2]}.{each}"] for each in ("q01", "q99")}
         for name in ("observation.state", "action")
     }
     before, after = make_pi05_pre_post_processors(policy.config, statistics)
-    images = {
-        f"observation.images.{camera}": values.permute(0, 3, 1, 2).float() / 255
-        for camera, values in zip(CAMERAS, given["images"], strict=False)
-    }
-    batch = before({**images, "observation.state": given["state"], "action": given["actions"], "task": [*TASKS]})
+    batch = before(raw())
     seen, present = policy._preprocess_images(batch)
-    chunk = policy.predict_action_chunk(batch, noise=given["noise"])
     return {
         "way.image": seen[0],
         "way.present": torch.stack(present, 1),
@@ -122,20 +152,38 @@ def way_results(policy: modeling_pi05.PI05Policy) -> dict[str, Tensor]:
         "way.sentence": batch["observation.language.attention_mask"],
         "way.state": batch["observation.state"],
         "way.actions": policy.prepare_action(batch),
-        "way.commands": after(chunk),
+        "way.commands": after(policy.predict_action_chunk(batch, noise=given["noise"])),
     }
+
+
+def exported_results(folder: Path) -> Tensor:
+    """Return the commands of LeRobot's policy and processors that are loaded from what is exported here."""
+    model = make_policy("pi05", write_tokenizer(folder))
+    take_statistics(model)
+    LeRobotPolicyExporter(folder / "exported").export_policy(as_policy(model, SPEC))
+    theirs = modeling_pi05.PI05Policy.from_pretrained(folder / "exported", strict=False)
+    weights = {name.removeprefix("model."): weight for name, weight in theirs.state_dict().items()}
+    assert all(torch.equal(weights[name], weight) for name, weight in published(model.network))
+    before, after = (
+        PolicyProcessorPipeline.from_pretrained(folder / "exported", config_filename=f"policy_{part}.json", **options)
+        for part, options in (
+            ("preprocessor", {}),
+            ("postprocessor", {"to_transition": policy_action_to_transition, "to_output": transition_to_policy_action}),
+        )
+    )
+    return after(theirs.predict_action_chunk(before(raw()), noise=observed()["noise"]))
 
 
 def main() -> None:
     """Write what LeRobot computes, and print how far it is from what was written before."""
+    without_hub()
     policy = their_policy()
     results = {**network_results(policy.model), **way_results(policy)}
-    results = {name: value.detach().contiguous().clone() for name, value in results.items()}
-    path = REFERENCE / "pi05.safetensors"
-    if path.exists():
-        for name, stored in load_file(path).items():
-            print(f"{name} {deviation(stored, results[name]):.1e}")
-    save_file(results, path)
+    write("pi05", results)
+    with TemporaryDirectory() as folder:
+        off = deviation(exported_results(Path(folder)), results["way.commands"])
+        print(f"commands of our export {off:.1e}")
+        assert off <= TOLERANCE
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ Runs in the environment of pi05.py. The published files lack the embeddings of w
 from __future__ import annotations
 
 import json
+import math
 import re
 from types import SimpleNamespace
 from typing import Any
@@ -13,30 +14,33 @@ from typing import Any
 import lerobot_modules  # first: it makes the imports of LeRobot possible  # noqa: F401
 import newer_python  # noqa: F401
 import torch
-from lerobot.policies.pi0 import modeling_pi0
-from lerobot.policies.pi05 import modeling_pi05
+from lerobot.policies.pi0.modeling_pi0 import PI0Pytorch
+from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
 from tiny_vla import REFERENCE
-from torch import nn
 
 EMBEDDINGS = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
 SOURCE = (
-    "state_dict() of {name} in LeRobot 0.6.1 at its published sizes, without the embeddings of words: {count} names. "
-    "LeRobot's issues {issues} quote their beginnings, the missing embeddings, and as many names in {repository}."
+    "{name} of LeRobot 0.6.1 at its published sizes, without the embeddings of words. Its issues {issues} quote the "
+    "beginnings of these names, the missing embeddings and the number of tensors in huggingface.co/lerobot/{repository}"
 )
-PUBLISHED = {"pi0": ("PI0Pytorch", "pi0_base", "#2291 and #3109"), "pi05": ("PI05Pytorch", "pi05_base", "#2307")}
+PUBLISHED = {  # class → repository, and issues about its file
+    PI0Pytorch: ("pi0_base", "#2291 and #3109"),
+    PI05Pytorch: ("pi05_base", "#2307 (and of a descendant elsewhere, 812)"),
+}
 
 
-def listed(network: nn.Module) -> dict[str, list[int]]:
-    """Return name → shape; layers of one kind are one name, with their number in braces."""
-    shapes = {name: [*weight.shape] for name, weight in network.state_dict().items() if name != EMBEDDINGS}
+def rows(shapes: dict[str, list[int]]) -> list[list[Any]]:
+    """Return name, layers and shape; layers of one kind are one row, with a star in place of their numbers."""
     layers = dict[str, set[int]]()
     for name in shapes:
-        if found := re.search(r"\.layers\.(\d+)\.", name):
-            layers.setdefault(name.replace(found[0], ".layers.{}."), set()).add(int(found[1]))
+        found = re.search(r"\.layers\.(\d+)\.", name)
+        starred = name.replace(found[0], ".layers.*.") if found else name
+        layers.setdefault(starred, set()).update({int(found[1])} if found else set())
     assert all(numbers == {*range(len(numbers))} for numbers in layers.values())
-    named = {name.replace("{}", f"{{{len(numbers)}}}"): name.replace("{}", "0") for name, numbers in layers.items()}
-    single = {name: name for name in shapes if ".layers." not in name}
-    return {name: shapes[first] for name, first in sorted({**single, **named}.items())}
+    return [
+        [name, f"0:{len(numbers)}" if numbers else "", shapes[name.replace("*", "0")]]
+        for name, numbers in sorted(layers.items())
+    ]
 
 
 def main() -> None:
@@ -44,18 +48,20 @@ def main() -> None:
     options: dict[str, Any] = {"dtype": "float32", "image_resolution": (224, 224), "max_action_dim": 32}
     options |= {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m", "max_state_dim": 32}
     options |= {"freeze_vision_encoder": False, "train_expert_only": False, "compile_model": False}
-    for module, (key, (name, repository, issues)) in zip((modeling_pi0, modeling_pi05), PUBLISHED.items(), strict=True):
+    for kind, (repository, issues) in PUBLISHED.items():
         with torch.device("meta"):
-            network = getattr(module, name)(SimpleNamespace(**options))
-        count = sum(weight != EMBEDDINGS for weight in network.state_dict())
-        source = SOURCE.format(name=name, count=count, repository=f"lerobot/{repository}", issues=issues)
-        text = json.dumps({"source": source, "shapes": listed(network)}, indent=0).replace("\n]", "]")
-        (REFERENCE / f"{key}_names.json").write_text(re.sub(r"\[\n([\d,\n]+)\]", _in_line, text) + "\n")
-        print(key, count)
-
-
-def _in_line(match: re.Match[str]) -> str:
-    return f"[{match[1].strip().replace(',', ', ').replace(chr(10), '')}]"
+            network = kind(SimpleNamespace(**options))
+        shapes = {name: [*weight.shape] for name, weight in network.state_dict().items() if name != EMBEDDINGS}
+        values = {
+            "source": SOURCE.format(name=kind.__name__, issues=issues, repository=repository),
+            "tensors": len(shapes),
+            "numbers": sum(map(math.prod, shapes.values())),
+        }
+        head = [f"  {json.dumps(name)}: {json.dumps(value)}," for name, value in values.items()]
+        body = ",\n".join(f"    {json.dumps(row)}" for row in rows(shapes))
+        text = "\n".join(["{", *head, '  "weights": [', body, "  ]", "}", ""])
+        (REFERENCE / f"{repository}.json").write_text(text, encoding="utf-8")
+        print(repository, values)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,9 @@ class PI05(PaliGemmaWithExpert):
         config = self.expert.config
         width, layers = config.hidden_size, range(config.num_hidden_layers)
         self.expert.layers = nn.ModuleList(AdaptiveLayer(config, number) for number in layers)
+        for layer in self.expert.layers:
+            for part in (layer.self_attn, layer.mlp):
+                part.apply(self.expert._init_weights)
         self.expert.norm = AdaptiveNorm(width, config.rms_norm_eps)
         self.time_mlp_in, self.time_mlp_out = nn.Linear(width, width), nn.Linear(width, width)
 
