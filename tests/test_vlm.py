@@ -134,7 +134,7 @@ def test_images_of_another_aspect_ratio_lie_in_the_corner_or_in_the_centre() -> 
 
 def test_the_state_is_read_as_numbers_within_the_prompt(tokenizer: Path) -> None:
     for name in (str(tokenizer), None):
-        prompt = Prompt(name, 90, state=True)
+        prompt = Prompt(name, 90, state=True, width=1)
         state = torch.tensor([[-1.5, -1.0, 0.0, 0.999], [0.5, 0.25, -0.2, 2.0]])
         tokens = prompt(prompt.tokenize(["lift_it\n", "put the block away"]), state)
         # Bins as openpi computes them.
@@ -161,6 +161,21 @@ def test_a_model_overfits_saves_and_ignores_truth() -> None:
     del batch["truth"]
     with torch.inference_mode():
         assert torch.equal(other.predict(batch).actions, model.predict(batch).actions)
+
+
+def test_linear_maps_in_another_layout_compute_the_same_and_follow_their_weights() -> None:
+    model = make_smolvla()
+    batch = with_text(model, make_batch(1, CHUNK, spec=SPEC))
+    for _ in range(2):
+        with torch.no_grad():
+            plain = model.predict(batch).actions
+        with torch.inference_mode():
+            assert deviation(model.predict(batch).actions, plain) < 1e-5
+        with torch.no_grad():  # as an optimiser does
+            for weight in model.network.parameters():
+                weight.mul_(1.1)
+    with torch.no_grad():
+        assert deviation(model.predict(batch).actions, plain) > 1e-2
 
 
 def written(folder: Path, tokenizer: Path, change: Callable[[dict[str, Any]], None] | None = None) -> Path:

@@ -103,7 +103,7 @@ def make_smolvla(tokenizer: Path | None = None, **options: Any) -> VisionLanguag
     """A tiny SmolVLA with the weights of `fill` and the statistics of `steps`."""
     parts: dict[str, Any] = {
         "network": partial(SmolVLA, **SMOLVLA),
-        "text": partial(Prompt, str(tokenizer) if tokenizer else None, LENGTH),
+        "text": partial(Prompt, str(tokenizer) if tokenizer else None, LENGTH, False),
         "tokenizer": Uniform(spec=SPEC, **defaults_of("tokenizer/uniform", bins=64)),
         "spec": SPEC,
     }

@@ -174,7 +174,7 @@ def compare_inputs(theirs: SmolVLAPolicy, before: Any, model: Any) -> dict[str, 
     results = {
         "way.images": torch.cat(prepared),
         "way.state": theirs.prepare_state(given[0]),
-        "way.actions": theirs.prepare_action(given[0])[0],
+        "way.actions": theirs.prepare_action(given[0]).reshape(CHUNK, -1),
         "way.tokens": torch.cat(tokens),
     }
     frames = torch.stack([torch.from_numpy(seen.rgb[camera]) for camera in SPEC.cameras])

@@ -17,9 +17,10 @@ from torch import Tensor
 
 from vla.config.compose import compose
 from vla.models.vlm.network import FlowNetwork
+from vla.models.vlm.packed_linear import pack
 from vla.models.vlm.smolvla import SmolVLA
 
-CHUNK, STEPS, LENGTH, PLANS = 50, 10, 48, 7
+CHUNK, STEPS, LENGTH, PLANS = 50, 10, 48, 5
 SMALL = {  # 0.1 B weights
     **{"width": 480, "layers": 8, "heads": 8, "key_heads": 4, "head_width": 64, "feedforward": 1280},
     **{"vision_width": 384, "vision_layers": 12, "vision_heads": 6, "vision_feedforward": 1536, "resolution": 256},
@@ -45,6 +46,7 @@ def main(size: str, cameras: int, *options: str) -> None:
     with torch.no_grad():
         for name, weight in published(ours):
             weight.copy_(named[name])
+    pack(ours)
     random, resolution = torch.Generator().manual_seed(0), sizes["resolution"]
     images = torch.rand(1, cameras, 3, resolution, resolution, generator=random) * 2 - 1
     tokens, sentence = (

@@ -21,11 +21,11 @@ from vla.io.errors import UserError
 from vla.io.types import Shift, Steps, Text
 from vla.models.layers import Batch, mean_where
 from vla.models.model import Model, Prediction
-from vla.models.text.ngrams import TextEncoder
 from vla.models.tokenizers.tokenizer import ActionTokenizer
 from vla.models.vlm.network import FlowNetwork, Prefix
 from vla.models.vlm.normalizer import Kind, Normalizer
-from vla.models.vlm.prompt import PADDING
+from vla.models.vlm.packed_linear import pack
+from vla.models.vlm.prompt import PADDING, Prompt
 from vla.models.vlm.trunk import Trunk
 from vla.spec import Spec
 
@@ -67,7 +67,7 @@ class VisionLanguageAction(Model):
     def __init__(
         self,
         network: Callable[[], FlowNetwork],
-        text: Callable[..., TextEncoder],
+        text: Callable[..., Prompt],
         trunk: Text | None,
         cameras: dict[str, str | None] | None,
         chunk: Steps,
@@ -77,7 +77,7 @@ class VisionLanguageAction(Model):
         normalization: Kind,
         statistics: Literal["demonstrations", "pretrained"],
         place: Place,
-        shift: Shift = (0, 0),
+        shift: Shift,
         *,
         spec: Spec,
         tokenizer: ActionTokenizer,
@@ -88,6 +88,7 @@ class VisionLanguageAction(Model):
         origin = None if trunk is None else Trunk(trunk)
         self.cameras = _cameras(cameras, spec, origin)
         self.network = network() if origin is None else origin.build(network)
+        pack(self.network)
         _require_width("state", len(spec.pose), self.network.state_width or len(spec.pose))
         _require_width("action", len(spec.action), self.network.action_width)
         self.state_normalizer = Normalizer(normalization, len(spec.pose))

@@ -44,7 +44,7 @@ class Prompt(TextEncoder):
     numbers: Tensor  # (BINS + 1, W) tokens of " -1" to " 255"
     end: Tensor  # tokens after the numbers
 
-    def __init__(self, name: Text | None, length: Steps, state: bool = False, *, width: int = 1) -> None:
+    def __init__(self, name: Text | None, length: Steps, state: bool, *, width: int) -> None:
         super().__init__(width)
         self.name, self.length, self.state = name, length, state
         self._tokenizer, self._sha256 = (None, None) if name is None else _tokenizer(name)

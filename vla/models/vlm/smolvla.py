@@ -111,6 +111,12 @@ class SmolVLA(FlowNetwork):
         self.action_time_mlp_in = nn.Linear(2 * expert_width, expert_width)
         self.action_time_mlp_out = nn.Linear(expert_width, expert_width)
 
+    def options(self) -> dict[str, Any]:
+        """Return LeRobot's options of this network; the width of the expert is a factor of that of the trunk."""
+        ratio = self.action_in_proj.out_features / self.state_proj.out_features
+        layers = {"num_vlm_layers": len(self.expert.layers), "self_attn_every_n_layers": self.joint_every}
+        return {**layers, "expert_width_multiplier": ratio, "resize_imgs_with_padding": [self.resolution] * 2}
+
     def prefix(self, images: Tensor, cameras: Tensor, tokens: Tensor, sentence: Tensor, state: Tensor | None) -> Prefix:
         """Encode images, sentence and state; every layer of the expert gets keys and values as it uses them."""
         assert state is not None
