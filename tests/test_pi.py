@@ -69,7 +69,7 @@ def test_a_time_per_action_is_that_of_the_action(name: str) -> None:
         prefix = encoded(network, given)
         together = network.velocity(prefix, given["noise"], given["time"])
         times = given["time"][:, None].repeat(1, given["noise"].shape[1])
-        assert deviation(network.velocity(prefix, given["noise"], times), together) < 1e-6
+        assert deviation(network.velocity(prefix, given["noise"], times), together) < TOLERANCE
         times[:, :3] = 0.0  # a chunk whose beginning is known already
         assert not torch.allclose(network.velocity(prefix, given["noise"], times), together)
 

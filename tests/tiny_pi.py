@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from defaults import defaults_of, part_of
+from fake_batch import as_policy
 from tiny_vla import fill, published
 from tokenizers import Tokenizer
 from tokenizers.models import BPE
@@ -20,6 +21,7 @@ from tokenizers.processors import TemplateProcessing
 from torch import Tensor
 
 from vla.models.tokenizers.tokenizer import Uniform
+from vla.models.vlm.lerobot_export import LeRobotPolicyExporter
 from vla.models.vlm.network import FlowNetwork
 from vla.models.vlm.pi0 import PI0
 from vla.models.vlm.pi05 import PI05
@@ -35,7 +37,7 @@ SIZES: dict[str, Any] = {
 }
 STATE_WIDTH = 8  # of π0
 CHUNK, STEPS = 10, 10
-LENGTH = 64  # of a prompt
+LENGTH = 56  # of a prompt, for which one of `TASKS` is too long
 KINDS: dict[str, type[FlowNetwork]] = {"pi0": PI0, "pi05": PI05}
 
 # Of the whole way from an observation to a command: state and action are narrower than what they are padded to.
@@ -143,3 +145,10 @@ def batch_of(model: VisionLanguageAction) -> dict[str, Any]:
         "text": model.text.tokenize([*TASKS]),
         "noise": given["noise"],
     }
+
+
+def export_pi05(folder: Path) -> None:
+    """Write π0.5 with the statistics of `observed` as LeRobot has it, in `folder`/exported."""
+    model = make_policy("pi05", write_tokenizer(folder))
+    take_statistics(model)
+    LeRobotPolicyExporter(folder / "exported").export_policy(as_policy(model, SPEC))

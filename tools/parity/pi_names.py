@@ -19,13 +19,13 @@ from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
 from tiny_vla import REFERENCE
 
 EMBEDDINGS = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
-SOURCE = (
-    "{name} of LeRobot 0.6.1 at its published sizes, without the embeddings of words. Its issues {issues} quote the "
-    "beginnings of these names, the missing embeddings and the number of tensors in huggingface.co/lerobot/{repository}"
-)
-PUBLISHED = {  # class → repository, and issues about its file
-    PI0Pytorch: ("pi0_base", "#2291 and #3109"),
-    PI05Pytorch: ("pi05_base", "#2307 (and of a descendant elsewhere, 812)"),
+SOURCE = "{name} of LeRobot 0.6.1 at its published sizes, without the embeddings of words; not its file itself. {known}"
+PUBLISHED = {  # class → repository, and what is known of its file
+    PI0Pytorch: (
+        "pi0_base",
+        "LeRobot's issues #2291 and #3109 quote names, 777 tensors, no embeddings.",
+    ),
+    PI05Pytorch: ("pi05_base", "LeRobot's issue #2307 tells of the embeddings; a descendant has 812 tensors."),
 }
 
 
@@ -48,12 +48,12 @@ def main() -> None:
     options: dict[str, Any] = {"dtype": "float32", "image_resolution": (224, 224), "max_action_dim": 32}
     options |= {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m", "max_state_dim": 32}
     options |= {"freeze_vision_encoder": False, "train_expert_only": False, "compile_model": False}
-    for kind, (repository, issues) in PUBLISHED.items():
+    for kind, (repository, known) in PUBLISHED.items():
         with torch.device("meta"):
             network = kind(SimpleNamespace(**options))
         shapes = {name: [*weight.shape] for name, weight in network.state_dict().items() if name != EMBEDDINGS}
         values = {
-            "source": SOURCE.format(name=kind.__name__, issues=issues, repository=repository),
+            "source": SOURCE.format(name=kind.__name__, known=known),
             "tensors": len(shapes),
             "numbers": sum(map(math.prod, shapes.values())),
         }
