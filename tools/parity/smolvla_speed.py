@@ -20,7 +20,7 @@ from vla.models.vlm.network import FlowNetwork
 from vla.models.vlm.packed_linear import pack
 from vla.models.vlm.smolvla import SmolVLA
 
-CHUNK, STEPS, LENGTH, PLANS = 50, 10, 48, 5
+CHUNK, STEPS, LENGTH, PLANS = 50, 10, 48, 3
 SMALL = {  # 0.1 B weights
     **{"width": 480, "layers": 8, "heads": 8, "key_heads": 4, "head_width": 64, "feedforward": 1280},
     **{"vision_width": 384, "vision_layers": 12, "vision_heads": 6, "vision_feedforward": 1536, "resolution": 256},

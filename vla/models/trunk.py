@@ -54,8 +54,9 @@ def trunks(model: nn.Module) -> dict[str, Source]:
     found = dict[str, Source]()
     for name, module in model.named_modules():
         source = getattr(module, "source", None)
-        trained = any(weight.requires_grad and not is_factor(each) for each, weight in module.named_parameters())
-        if isinstance(source, Source) and not trained and not is_within(name, found):
+        if not isinstance(source, Source) or is_within(name, found):
+            continue
+        if not any(weight.requires_grad and not is_factor(each) for each, weight in module.named_parameters()):
             found[name] = source
     return found
 

@@ -16,7 +16,16 @@ PACKED: WeakKeyDictionary[nn.Module, Packed] = WeakKeyDictionary()  # no part of
 
 
 class PackedLinear(nn.Linear):
-    """`nn.Linear` with the same parameters, which has its weight in another layout, too, once it acted in float32."""
+    """`nn.Linear` with the same parameters, which has its weight in another layout, too, once it acted in float32.
+
+    Fused optimisers do not tell that they change a weight: so the other layout is dropped when a training goes on.
+    """
+
+    def train(self, mode: bool = True) -> PackedLinear:
+        """Drop the other layout before a training."""
+        if mode:
+            PACKED.pop(self, None)
+        return super().train(mode)
 
     def forward(self, input: Tensor) -> Tensor:
         """Map (…, inputs) to (…, outputs)."""

@@ -24,6 +24,7 @@ from vla.models.vlm.network import FlowNetwork, Prefix
 ROPE_BASE = 10_000.0  # of the policy, whatever that of the language model was
 MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the time embedding
 EPSILON = 1e-5  # of RMS norms
+NO_TOKENS: dict[str, None] = {"bos_token_id": None, "eos_token_id": None}  # nothing is generated
 
 Rotation = tuple[Tensor, Tensor]  # cosines and sines of positions, (B, N, H) each
 
@@ -91,20 +92,12 @@ class SmolVLA(FlowNetwork):
         self.resolution, self.state_width, self.action_width = resolution, state_width, action_width
         self.head_width, self.joint_every = head_width, joint_every
         attention = {"num_attention_heads": heads, "num_key_value_heads": key_heads, "head_dim": head_width}
-        shared = {**attention, "num_hidden_layers": layers, "rms_norm_eps": EPSILON}
-        shared |= {"bos_token_id": None, "eos_token_id": None}
-        text = {"hidden_size": width, "intermediate_size": feedforward, "vocab_size": vocabulary}
-        vision = {"hidden_size": vision_width, "num_hidden_layers": vision_layers, "num_attention_heads": vision_heads}
-        vision |= {"intermediate_size": vision_feedforward, "image_size": resolution, "patch_size": patch}
-        # Heads need not fill the width of the expert, which the check of its configuration demands.
-        expert = LlamaConfig(**shared, hidden_size=heads, intermediate_size=expert_feedforward, vocab_size=1)
-        expert.hidden_size = expert_width
-        trunk = {"model_type": "llama", **shared, **text}
-        self.vlm = SmolVLMModel(SmolVLMConfig(text_config=trunk, vision_config=vision, scale_factor=shuffle))
-        self.expert = LlamaModel(expert)
-        del self.expert.embed_tokens  # its input is no text
-        for number, layer in enumerate(self.expert.layers):
-            layer.self_attn = ExpertAttention(expert, number, joint=number % joint_every == 0)
+        shared = {**attention, "num_hidden_layers": layers, "rms_norm_eps": EPSILON, **NO_TOKENS}
+        text = {**shared, "vocab_size": vocabulary, **_sizes(width, feedforward)}
+        vision = {"num_hidden_layers": vision_layers, "num_attention_heads": vision_heads, "patch_size": patch}
+        vision |= {"image_size": resolution, **_sizes(vision_width, vision_feedforward)}
+        self.vlm = _trunk(text, vision, shuffle)
+        self.expert = _expert(shared, joint_every, expert_width, expert_feedforward)
         self.state_proj = nn.Linear(state_width, width)
         self.action_in_proj = nn.Linear(action_width, expert_width)
         self.action_out_proj = nn.Linear(expert_width, action_width)
@@ -202,6 +195,28 @@ class Kept:
         """Keep those of the next layer."""
         self.pairs.append((keys, values))
         return keys, values
+
+
+def _sizes(width: int, feedforward: int) -> dict[str, int]:
+    return {"hidden_size": width, "intermediate_size": feedforward}
+
+
+def _trunk(text: dict[str, Any], vision: dict[str, Any], shuffle: int) -> SmolVLMModel:
+    """Build vision_model, connector and text_model."""
+    config = SmolVLMConfig(text_config={"model_type": "llama", **text}, vision_config=vision, scale_factor=shuffle)
+    return SmolVLMModel(config)
+
+
+def _expert(shared: dict[str, Any], joint_every: int, width: int, feedforward: int) -> LlamaModel:
+    """Build the expert, whose input is no text."""
+    # Heads need not fill its width, which the check of its configuration demands.
+    config = LlamaConfig(**shared, vocab_size=1, **_sizes(shared["num_attention_heads"], feedforward))
+    config.hidden_size = width
+    expert = LlamaModel(config)
+    del expert.embed_tokens
+    for number, layer in enumerate(expert.layers):
+        layer.self_attn = ExpertAttention(config, number, joint=number % joint_every == 0)
+    return expert
 
 
 def rotation_of(positions: Tensor, width: int) -> Rotation:
