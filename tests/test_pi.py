@@ -15,8 +15,8 @@ each = pytest.mark.parametrize("name", KINDS)
 
 
 def encoded(network: FlowNetwork, given: dict[str, Tensor]) -> Prefix:
-    known = (given[name] for name in ("images", "cameras", "tokens", "sentence"))
-    return network.prefix(*known, given["state"] if network.state_width else None)
+    images, cameras, tokens, sentence = (given[name] for name in ("images", "cameras", "tokens", "sentence"))
+    return network.prefix(images, cameras, tokens, sentence, given["state"] if network.state_width else None)
 
 
 @each

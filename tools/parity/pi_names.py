@@ -55,7 +55,7 @@ def main() -> None:
         values = {
             "source": SOURCE.format(name=kind.__name__, known=known),
             "tensors": len(shapes),
-            "numbers": sum(map(math.prod, shapes.values())),
+            "numbers": sum(math.prod(shape) for shape in shapes.values()),
         }
         head = [f"  {json.dumps(name)}: {json.dumps(value)}," for name, value in values.items()]
         body = ",\n".join(f"    {json.dumps(row)}" for row in rows(shapes))

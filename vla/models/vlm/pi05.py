@@ -27,10 +27,11 @@ class PI05(PaliGemmaWithExpert):
         super().__init__(**inherited)
         config = self.expert.config
         width, layers = config.hidden_size, range(config.num_hidden_layers)
-        self.expert.layers = nn.ModuleList(AdaptiveLayer(config, number) for number in layers)
-        for layer in self.expert.layers:
-            for part in (layer.self_attn, layer.mlp):
-                part.apply(self.expert._init_weights)
+        made = [AdaptiveLayer(config, number) for number in layers]
+        for layer in made:
+            layer.self_attn.apply(self.expert._init_weights)
+            layer.mlp.apply(self.expert._init_weights)
+        self.expert.layers = nn.ModuleList(made)
         self.expert.norm = AdaptiveNorm(width, config.rms_norm_eps)
         self.time_mlp_in, self.time_mlp_out = nn.Linear(width, width), nn.Linear(width, width)
 
