@@ -83,25 +83,13 @@ class PaliGemmaWithExpert(FlowNetwork):
         self.resolution, self.action_width, self.state_width = resolution, action_width, 0
         shared = {"num_attention_heads": heads, "num_key_value_heads": 1, "head_dim": head_width}
         shared |= {"num_hidden_layers": layers}
-        text = GemmaConfig(**shared, vocab_size=vocabulary, hidden_size=width, intermediate_size=feedforward)
-        vision = {"hidden_size": vision_width, "num_hidden_layers": vision_layers, "num_attention_heads": vision_heads}
-        vision |= {"intermediate_size": vision_feedforward, "image_size": resolution, "patch_size": patch}
-        encoder = SiglipVisionConfig(**vision, vision_use_head=False)
-        # The tokens of no text have ids, which must be within the vocabulary.
-        ids = dict.fromkeys(("pad_token_id", "bos_token_id", "eos_token_id"), 0)
-        expert = GemmaConfig(
-            **shared, **ids, vocab_size=1, hidden_size=expert_width, intermediate_size=expert_feedforward
-        )
-        trunk = PaliGemmaConfig(vision_config=encoder, text_config=text, projection_dim=width)
-        self.paligemma, self.expert = PaliGemmaModel(trunk), GemmaModel(expert)
-        del self.expert.embed_tokens  # its input is no text
+        text = {**shared, "vocab_size": vocabulary, **_sizes(width, feedforward)}
+        vision = {"num_hidden_layers": vision_layers, "num_attention_heads": vision_heads, "patch_size": patch}
+        vision |= {"image_size": resolution, **_sizes(vision_width, vision_feedforward)}
+        self.paligemma = _trunk(text, vision)
+        self.expert = _expert({**shared, **_sizes(expert_width, expert_feedforward)})
         self.action_in_proj = nn.Linear(action_width, expert_width)
         self.action_out_proj = nn.Linear(expert_width, action_width)
-        # Actions see the keys and values of the last layer, and nothing that is made with them.
-        last = self.paligemma.language_model.layers[-1]
-        for idle in (last.self_attn.q_proj, last.self_attn.o_proj, last.post_attention_layernorm, last.mlp):
-            idle.requires_grad_(False)
-        self.paligemma.language_model.norm.requires_grad_(False)
 
     def options(self) -> dict[str, Any]:
         """Return LeRobot's options of this network, whose other sizes it does not let one choose."""
@@ -165,6 +153,33 @@ class Own:
         if self._others is None:
             return keys, values
         return torch.cat([self._others[0], keys], 2), torch.cat([self._others[1], values], 2)
+
+
+def _sizes(width: int, feedforward: int) -> dict[str, int]:
+    return {"hidden_size": width, "intermediate_size": feedforward}
+
+
+def _trunk(text: dict[str, Any], vision: dict[str, Any]) -> PaliGemmaModel:
+    """Build vision_tower, multi_modal_projector and language_model, without gradients of what no action depends on."""
+    encoder = SiglipVisionConfig(**vision, vision_use_head=False)
+    width = text["hidden_size"]
+    trunk = PaliGemmaModel(
+        PaliGemmaConfig(vision_config=encoder, text_config=GemmaConfig(**text), projection_dim=width)
+    )
+    # Actions see the keys and values of the last layer, and nothing that is made with them.
+    last = trunk.language_model.layers[-1]
+    for idle in (last.self_attn.q_proj, last.self_attn.o_proj, last.post_attention_layernorm, last.mlp):
+        idle.requires_grad_(False)
+    trunk.language_model.norm.requires_grad_(False)
+    return trunk
+
+
+def _expert(sizes: dict[str, int]) -> GemmaModel:
+    """Build the expert, whose input is no text."""
+    # Ids of the tokens of no text must be within its vocabulary, too.
+    expert = GemmaModel(GemmaConfig(**sizes, vocab_size=1, pad_token_id=0, bos_token_id=0, eos_token_id=0))
+    del expert.embed_tokens
+    return expert
 
 
 def joined(first: Prefix, second: Prefix) -> Prefix:

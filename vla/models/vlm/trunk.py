@@ -119,7 +119,8 @@ class Trunk:
 def materialize(network: nn.Module) -> None:
     """Give all tensors on the device "meta" memory, and the values of an untrained network."""
     for weight in network.parameters():
-        weight._is_hf_initialized = not weight.is_meta  # by which transformers leaves those of parts of a module alone
+        marked: Any = weight
+        marked._is_hf_initialized = not weight.is_meta  # transformers leaves those alone that are
     for name, module in network.named_modules():
         own = [*module.named_parameters(recurse=False), *module.named_buffers(recurse=False)]
         if not any(tensor.is_meta for _, tensor in own):
