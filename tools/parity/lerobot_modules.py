@@ -16,7 +16,19 @@ from types import ModuleType
 from typing import Any
 
 # What LeRobot imports, and nothing compared here calls.
-LIBRARIES = ("accelerate", "av", "cv2", "datasets", "deepdiff", "einops", "gymnasium", "imageio", "jsonlines", "serial")
+LIBRARIES = (
+    "accelerate",
+    "av",
+    "cv2",
+    "datasets",
+    "deepdiff",
+    "einops",
+    "gymnasium",
+    "imageio",
+    "jsonlines",
+    "peft",
+    "serial",
+)
 PARTS = ("lerobot.configs.train", "lerobot.datasets", "lerobot.envs", "lerobot.robots", "lerobot.teleoperators")
 
 

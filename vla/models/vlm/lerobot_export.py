@@ -95,18 +95,19 @@ def _features(model: VisionLanguageAction) -> tuple[dict[str, Any], dict[str, An
 def _preprocessing(model: VisionLanguageAction) -> list[dict[str, Any]]:
     prompt = _prompt(model)
     tokens = {"max_length": prompt.length, "task_key": "task", "padding_side": "right", "padding": "max_length"}
+    reader = "prepare_state_tokenizer_processor_step" if prompt.state else "new_line_processor"
     inputs, outputs = _features(model)
     normalizer = _step(NORMALIZER, model, {**inputs, **outputs}, "policy_preprocessor_step_5_normalizer_processor")
     return [
         {"registry_name": "rename_observations_processor", "config": {"rename_map": {}}},
         {"registry_name": "to_batch_processor", "config": {}},
-        {"registry_name": f"{model.network.kind}_new_line_processor", "config": {}},
+        normalizer,  # before the state becomes text
+        {"registry_name": f"{model.network.kind}_{reader}", "config": {}},
         {
             "registry_name": "tokenizer_processor",
             "config": {**tokens, "truncation": True, "tokenizer_name": prompt.name},
         },
         {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}},
-        normalizer,
     ]
 
 

@@ -118,15 +118,18 @@ class Trunk:
 
 def materialize(network: nn.Module) -> None:
     """Give all tensors on the device "meta" memory, and the values of an untrained network."""
+    for weight in network.parameters():
+        marked: Any = weight
+        marked._is_hf_initialized = not weight.is_meta  # transformers leaves those alone that are
     for name, module in network.named_modules():
         own = [*module.named_parameters(recurse=False), *module.named_buffers(recurse=False)]
         if not any(tensor.is_meta for _, tensor in own):
             continue
-        loaded = {key: tensor for key, tensor in own if not tensor.is_meta}
+        loaded = {key: tensor.data for key, tensor in own if not tensor.is_meta}
         module.to_empty(device="cpu", recurse=False)
         _initialize(network, name, module)
         for key, tensor in loaded.items():
-            getattr(module, key).data = tensor.data
+            getattr(module, key).data = tensor
 
 
 @torch.no_grad()

@@ -1,0 +1,82 @@
+"""π0 and π0.5 against what transformers and LeRobot compute with equal weights, noise and times."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tiny_pi import KINDS, STEPS, inputs, make_network
+from tiny_vla import deviation, reference
+from torch import Tensor
+
+from vla.models.vlm.network import FlowNetwork, Prefix
+
+TOLERANCE = 1e-5
+each = pytest.mark.parametrize("name", KINDS)
+
+
+def encoded(network: FlowNetwork, given: dict[str, Tensor]) -> Prefix:
+    images, cameras, tokens, sentence = (given[name] for name in ("images", "cameras", "tokens", "sentence"))
+    return network.prefix(images, cameras, tokens, sentence, given["state"] if network.state_width else None)
+
+
+@each
+def test_losses_and_gradients_are_those_of_the_reference(name: str) -> None:
+    network, given, theirs = make_network(name), inputs(), reference(name)
+    time, noise, actions = given["time"][:, None, None], given["noise"], given["actions"]
+    velocity = network.velocity(encoded(network, given), time * noise + (1 - time) * actions, given["time"])
+    losses = (velocity - (noise - actions)).square()
+    assert deviation(losses.detach(), theirs["losses"]) < TOLERANCE
+    losses.mean().backward()
+    gradients = {n.removeprefix("gradient."): value for n, value in theirs.items() if n.startswith("gradient.")}
+    assert len(gradients) == 3
+    for weight, gradient in gradients.items():
+        found = network.get_parameter(weight).grad
+        assert found is not None and deviation(found, gradient) < TOLERANCE
+
+
+@each
+def test_every_step_of_sampling_is_that_of_the_reference(name: str) -> None:
+    network, given, theirs = make_network(name), inputs(), reference(name)["steps"]
+    actions = given["noise"]
+    assert torch.equal(actions, theirs[0])
+    with torch.no_grad():
+        prefix = encoded(network, given)
+        for step in range(STEPS):
+            time = actions.new_full((len(actions),), 1 - step / STEPS)
+            actions = actions - network.velocity(prefix, actions, time) / STEPS
+            assert deviation(actions, theirs[step + 1]) < TOLERANCE
+
+
+@each
+def test_what_is_absent_has_no_effect_and_what_is_present_has(name: str) -> None:
+    network, given = make_network(name), inputs()
+
+    def result(**changed: Tensor) -> Tensor:
+        with torch.no_grad():
+            return network.velocity(encoded(network, {**given, **changed}), given["noise"], given["time"])
+
+    images, tokens = given["images"].clone(), given["tokens"].clone()
+    images[1, 1], tokens[1, 5:] = 0.3, 7
+    assert torch.equal(result(), result(images=images, tokens=tokens))
+    images[0, 1], tokens[1, 4] = 0.3, 7
+    assert not torch.allclose(result(), result(images=images)) and not torch.allclose(result(), result(tokens=tokens))
+
+
+@each
+def test_a_time_per_action_is_that_of_the_action(name: str) -> None:
+    network, given = make_network(name), inputs()
+    with torch.no_grad():
+        prefix = encoded(network, given)
+        together = network.velocity(prefix, given["noise"], given["time"])
+        times = given["time"][:, None].repeat(1, given["noise"].shape[1])
+        assert deviation(network.velocity(prefix, given["noise"], times), together) < TOLERANCE
+        times[:, :3] = 0.0  # a chunk whose beginning is known already
+        assert not torch.allclose(network.velocity(prefix, given["noise"], times), together)
+
+
+@each
+def test_all_that_is_trained_has_a_gradient(name: str) -> None:
+    """Otherwise processes of a training would wait for those of some weights."""
+    network, given = make_network(name), inputs()
+    network.velocity(encoded(network, given), given["noise"], given["time"]).square().sum().backward()
+    assert [name for name, weight in network.named_parameters() if weight.requires_grad and weight.grad is None] == []

@@ -1,0 +1,110 @@
+"""π0 and π0.5 as policies: between an observation and a command, and with published weights."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from command_line import SMALL, here
+from safetensors.torch import save_file
+from tiny_pi import KINDS, SIZES, SPEC, batch_of, make_network, make_policy, observed, take_statistics, write_tokenizer
+from tiny_vla import REFERENCE, deviation, published, reference
+from torch import Tensor
+
+from vla.config.compose import compose
+from vla.io.errors import UserError
+from vla.models.vlm.network import renamed
+from vla.models.vlm.prompt import PADDING
+
+TOLERANCE = 1e-5
+each = pytest.mark.parametrize("name", KINDS)
+
+
+def test_the_way_from_observations_to_commands_is_that_of_lerobot(tmp_path: Path) -> None:
+    model, given, theirs = make_policy("pi05", write_tokenizer(tmp_path)), observed(), reference("pi05")
+    take_statistics(model)
+    state, batch = model.state_normalizer(given["state"]), batch_of(model)
+    tokens, sentence = model.text(batch["text"], state), theirs["way.sentence"].bool()
+    assert torch.equal(tokens != PADDING, sentence) and torch.equal(tokens[sentence], theirs["way.tokens"][sentence])
+    assert sentence[0].all() and not sentence[1].all()  # one prompt is cut, the other is not
+    assert deviation(state, theirs["way.state"]) < TOLERANCE
+    assert deviation(model.padded(given["actions"]), theirs["way.actions"]) < TOLERANCE
+    assert deviation(model.image(given["images"][0]), theirs["way.image"]) < TOLERANCE
+    assert theirs["way.present"].tolist() == [[True, True, False]] * 2  # a third camera is missing there
+    with torch.no_grad():
+        assert deviation(model.predict(batch).actions, theirs["way.commands"]) < TOLERANCE
+
+
+@each
+def test_names_and_shapes_are_those_that_are_published(name: str) -> None:
+    listed = json.loads((REFERENCE / f"{name}_base.json").read_text())
+    shapes = dict[str, list[int]]()
+    for weight, layers, shape in listed["weights"]:
+        for number in range(*map(int, layers.split(":"))) if layers else [0]:
+            shapes[weight.replace("*", str(number))] = shape
+    assert len(shapes) == listed["tensors"] == {"pi0": 777, "pi05": 812}[name]
+    arguments = {key: value for key, value in compose(f"model={name}").model.network.items() if key[0] != "_"}
+    with torch.device("meta"):
+        network = KINDS[name](**arguments)
+    ours = {weight: [*tensor.shape] for weight, tensor in network.named_parameters()}
+    used = {weight: shape for weight, shape in shapes.items() if not weight.startswith(network.unused)}
+    assert {renamed(weight, network.published): shape for weight, shape in used.items()} == ours
+    assert shapes.keys() - used.keys() == {"paligemma_with_expert.gemma_expert.lm_head.weight"}
+
+
+def write_published(folder: Path, name: str, without: str = "") -> dict[str, Tensor]:
+    """Write a folder as LeRobot publishes it, with the weights of `make_network` but for one; returns those."""
+    weights = {weight: tensor.detach().clone() for weight, tensor in published(make_network(name))}
+    unused = {"paligemma_with_expert.gemma_expert.lm_head.weight": torch.ones(SIZES["vocabulary"], 4)}
+    head = "model." if name == "pi05" else ""  # both are found
+    saved = {head + weight: tensor for weight, tensor in {**weights, **unused}.items() if weight != without}
+    save_file(saved, folder / "model.safetensors")
+    images = {f"observation.images.{camera}": {"type": "VISUAL", "shape": [3, 28, 28]} for camera in SPEC.cameras}
+    features = {**images, "observation.state": {"type": "STATE", "shape": [5]}}
+    config = {"type": name, "input_features": features, "output_features": {"action": {"type": "ACTION", "shape": [5]}}}
+    (folder / "config.json").write_text(json.dumps(config))
+    file = "policy_preprocessor_step_2_normalizer_processor.safetensors"
+    steps = [{"registry_name": "normalizer_processor", "config": {}, "state_file": file}]
+    (folder / "policy_preprocessor.json").write_text(json.dumps({"name": "policy_preprocessor", "steps": steps}))
+    given, kinds = observed(), ("mean", "std") if name == "pi0" else ("q01", "q99")
+    statistics = {
+        f"{feature}.{kind}": given[f"{feature.rpartition('.')[2]}.{quantile}"]
+        for feature in ("observation.state", "action")
+        for kind, quantile in zip(kinds, ("q01", "q99"), strict=True)
+    }
+    save_file(statistics, folder / file)
+    return weights
+
+
+@each
+def test_published_weights_and_statistics_are_loaded(name: str, tmp_path: Path) -> None:
+    weights = write_published(tmp_path, name)
+    model = make_policy(name, trunk=str(tmp_path), statistics="pretrained")
+    loaded = dict(published(model.network))
+    assert loaded.keys() == weights.keys()
+    assert all(torch.equal(tensor, weights[weight]) for weight, tensor in loaded.items())
+    other = make_policy(name)
+    with torch.no_grad():
+        assert not torch.equal(model.predict(batch_of(model)).actions, other.predict(batch_of(other)).actions)
+        other.state_normalizer.load_state_dict(model.state_normalizer.state_dict())
+        other.action_normalizer.load_state_dict(model.action_normalizer.state_dict())
+        assert torch.equal(model.predict(batch_of(model)).actions, other.predict(batch_of(other)).actions)
+
+
+@each
+def test_a_missing_weight_is_named(name: str, tmp_path: Path) -> None:
+    write_published(tmp_path, name, without="paligemma_with_expert.gemma_expert.model.layers.1.mlp.up_proj.weight")
+    with pytest.raises(UserError, match=r"lacks expert\.layers\.1\.mlp\.up_proj\.weight"):
+        make_policy(name, trunk=str(tmp_path))
+
+
+@each
+def test_it_trains_and_is_evaluated_and_saved_like_any_other_model(name: str, home: Path) -> None:
+    sizes = {**SIZES, "vocabulary": 256, "action_width": 32}
+    network = [f"model.network.{key}={value}" for key, value in sizes.items()]
+    tiny = ["model.text.name=null", "model.text.length=160", "model.chunk=8", "model.steps=2", "trainer.max_steps=2"]
+    here(home, *SMALL, f"model={name}", *network, *tiny, f"output={name}", f"hydra.run.dir={name}")
+    assert json.loads((home / name / "policy/config.json").read_text())["model"]["chunk"] == 8
+    assert (home / name / "policy/model.safetensors").is_file() and list((home / name).rglob("report.json"))

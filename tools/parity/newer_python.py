@@ -1,0 +1,34 @@
+"""Makes Python 3.11 read LeRobot 0.6, which is written for 3.12: its modules without their lists of type parameters."""
+
+from __future__ import annotations
+
+import re
+import sys
+from importlib.machinery import SourceFileLoader
+from typing import Any
+
+GENERIC = re.compile(r"^(class|def) (\w+)\[([^\]]+)\]\(", re.MULTILINE)
+
+
+def _with_variables(match: re.Match[str]) -> str:
+    kind, name, listed = match.groups()
+    if kind == "class":  # its variables exist in the module
+        return f'class {name}(__import__("typing").Generic[{listed}], '
+    variables = [each.partition(":")[0].strip() for each in listed.split(",")]
+    made = [f'{each} = __import__("typing").TypeVar("{each}")\n' for each in variables]
+    return f"{''.join(made)}def {name}("
+
+
+def _prepare() -> None:
+    compiled = SourceFileLoader.source_to_code
+
+    def without(self: SourceFileLoader, data: Any, path: Any, **options: Any) -> Any:
+        if "lerobot" in str(path):
+            data = GENERIC.sub(_with_variables, bytes(data).decode()).encode()
+        return compiled(self, data, path, **options)
+
+    SourceFileLoader.source_to_code = without
+
+
+if sys.version_info < (3, 12):
+    _prepare()

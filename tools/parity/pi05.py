@@ -1,0 +1,191 @@
+"""Compares π0.5 with LeRobot's own, of equal weights, noise and times, and writes what the tests compare with.
+
+Of the way around the network: images, prompts, normalised states and actions, and commands made of raw observations.
+LeRobot 0.6 with transformers 5.5 are in a folder of their own: PYTHONPATH=FOLDER:.:tests python tools/parity/pi05.py
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import SimpleNamespace
+from typing import Any
+
+import lerobot_modules  # first: it makes the imports of LeRobot possible  # noqa: F401
+import newer_python  # noqa: F401
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.pi05 import modeling_pi05
+from lerobot.policies.pi05.configuration_pi05 import PI05Config
+from lerobot.policies.pi05.processor_pi05 import make_pi05_pre_post_processors
+from lerobot.processor import PolicyProcessorPipeline, tokenizer_processor
+from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
+from references import TOLERANCE, write
+from safetensors.torch import load_file
+from tiny_pi import (
+    CHUNK,
+    LENGTH,
+    SIZES,
+    STEPS,
+    TASKS,
+    inputs,
+    observed,
+    tokenizer,
+)
+from tiny_vla import deviation, fill
+from torch import Tensor
+from transformers import GemmaConfig, PaliGemmaConfig, PreTrainedTokenizerFast
+
+CAMERAS = ("front", "side", "wrist")  # nobody has the last one
+GRADIENTS = {  # of the network, by its names here → LeRobot's
+    "paligemma.vision_tower.encoder.layers.0.mlp.fc1.weight": "paligemma.model.vision_tower.vision_model.",
+    "paligemma.language_model.layers.0.self_attn.v_proj.weight": "paligemma.model.",
+    "expert.layers.1.input_layernorm.dense.weight": "gemma_expert.model.",
+}
+
+
+def their_policy() -> modeling_pi05.PI05Policy:
+    """LeRobot's policy with a network of other sizes."""
+    own = modeling_pi05.PaliGemmaForConditionalGenerationWithPiGemma
+
+    def trunk(config: Any) -> Any:
+        """Without the sizes that it sets in any case."""
+        config.vision_config.projection_dim = config.text_config.hidden_size
+        config.vision_config.intermediate_size = SIZES["vision_feedforward"]
+        config.text_config.vocab_size = SIZES["vocabulary"]
+        return own(config=config)
+
+    vision = {
+        **{"hidden_size": SIZES["vision_width"], "num_hidden_layers": SIZES["vision_layers"]},
+        **{"num_attention_heads": SIZES["vision_heads"], "patch_size": SIZES["patch"], "vision_use_head": False},
+    }
+    gemma = modeling_pi05.GemmaConfig
+    heads = (SIZES["layers"], SIZES["heads"], SIZES["head_width"])
+    modeling_pi05.PaliGemmaForConditionalGenerationWithPiGemma = trunk
+    modeling_pi05.CONFIG_MAPPING = {
+        "paligemma": lambda: PaliGemmaConfig(vision_config={"model_type": "siglip_vision_model", **vision}),
+        "gemma": lambda **options: GemmaConfig(**{**options, "vocab_size": 4}),
+    }
+    modeling_pi05.get_gemma_config = lambda variant: gemma(
+        **{"depth": heads[0], "num_heads": heads[1], "num_kv_heads": 1, "head_dim": heads[2]},
+        width=SIZES["width" if variant == "gemma_2b" else "expert_width"],
+        mlp_dim=SIZES["feedforward" if variant == "gemma_2b" else "expert_feedforward"],
+    )
+    size = SIZES["resolution"]
+    images = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, size, size)) for name in CAMERAS}
+    state = {"observation.state": PolicyFeature(FeatureType.STATE, (5,))}
+    config = PI05Config(
+        **{"chunk_size": CHUNK, "n_action_steps": CHUNK, "max_action_dim": SIZES["action_width"], "device": "cpu"},
+        **{"num_inference_steps": STEPS, "image_resolution": (size, size), "tokenizer_max_length": LENGTH},
+        input_features={**images, **state},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (5,))},
+    )
+    policy = modeling_pi05.PI05Policy(config).eval()
+    fill((name.removeprefix("model."), weight) for name, weight in policy.state_dict().items())
+    trunk = policy.model.paligemma_with_expert.paligemma
+    trunk.model.language_model.embed_tokens.weight.data.copy_(trunk.lm_head.weight)  # one matrix is published as both
+    return policy
+
+
+def network_results(theirs: Any) -> dict[str, Tensor]:
+    """Return losses, (B, k, A), their gradients, and the actions at the beginning of every step and after the last."""
+    given, steps, denoise = inputs(), [], theirs.denoise_step
+    images, cameras = ([*given[name].unbind(1)] for name in ("images", "cameras"))
+    known = (images, cameras, given["tokens"], given["sentence"])
+    losses = theirs(*known, given["actions"], given["noise"], given["time"])
+    losses.mean().backward()
+
+    def recorded(**values: Any) -> Tensor:
+        steps.append(values["x_t"])
+        return denoise(**values)
+
+    theirs.denoise_step = recorded
+    steps.append(theirs.sample_actions(*known, noise=given["noise"]))
+    theirs.denoise_step = denoise
+    named = dict(theirs.named_parameters())
+    gradients = {
+        f"gradient.{name}": named[
+            f"paligemma_with_expert.{there}{name.partition('.')[2].removeprefix('vision_tower.')}"
+        ]
+        for name, there in GRADIENTS.items()
+    }
+    found = {name: weight.grad for name, weight in gradients.items()}
+    return {"losses": losses.detach(), "steps": torch.stack(steps), **found}
+
+
+def without_hub() -> None:
+    """Give LeRobot's processors our tokenizer in place of the hub's."""
+    reader = PreTrainedTokenizerFast(tokenizer_object=tokenizer(), pad_token="<pad>")
+    tokenizer_processor.AutoTokenizer = SimpleNamespace(from_pretrained=lambda name: reader)
+
+
+def raw() -> dict[str, Any]:
+    """Return the observations as LeRobot's processors take them."""
+    given = observed()
+    images = {
+        f"observation.images.{camera}": values.permute(0, 3, 1, 2).float() / 255
+        for camera, values in zip(CAMERAS, given["images"], strict=False)
+    }
+    return {**images, "observation.state": given["state"], "action": given["actions"], "task": [*TASKS]}
+
+
+def way_results(policy: modeling_pi05.PI05Policy) -> dict[str, Tensor]:
+    """Return what LeRobot makes of raw observations, and the commands it makes of what the network answers."""
+    given = observed()
+    statistics = {
+        name: {each: given[f"{name.rpartition('.')[2]}.{each}"] for each in ("q01", "q99")}
+        for name in ("observation.state", "action")
+    }
+    before, after = make_pi05_pre_post_processors(policy.config, statistics)
+    batch = before(raw())
+    seen, present = policy._preprocess_images(batch)
+    return {
+        "way.image": seen[0],
+        "way.present": torch.stack(present, 1),
+        "way.tokens": batch["observation.language.tokens"],
+        "way.sentence": batch["observation.language.attention_mask"],
+        "way.state": batch["observation.state"],
+        "way.actions": policy.prepare_action(batch),
+        "way.commands": after(policy.predict_action_chunk(batch, noise=given["noise"])),
+    }
+
+
+def exported_results(folder: Path) -> Tensor:
+    """Return the commands of LeRobot's policy and processors that are loaded from what is exported here."""
+    # With the newer transformers of this project, in which modules of the image encoder have other names.
+    code = f"from tiny_pi import *; export_pi05(Path({str(folder)!r}))"
+    ours = os.environ["PYTHONPATH"].partition(os.pathsep)[2]
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": ours}, check=True)
+    theirs = modeling_pi05.PI05Policy.from_pretrained(folder / "exported", strict=False)
+    state, written = theirs.state_dict(), load_file(folder / "exported/model.safetensors")
+    assert all(torch.equal(state[name], weight) for name, weight in written.items())
+    # The former is the same matrix as that of the head, and no action depends on the latter.
+    missing = {"paligemma.model.language_model.embed_tokens.weight", "gemma_expert.lm_head.weight"}
+    assert state.keys() - written.keys() == {f"model.paligemma_with_expert.{name}" for name in missing}
+    before, after = (
+        PolicyProcessorPipeline.from_pretrained(folder / "exported", config_filename=f"policy_{part}.json", **options)
+        for part, options in (
+            ("preprocessor", {}),
+            ("postprocessor", {"to_transition": policy_action_to_transition, "to_output": transition_to_policy_action}),
+        )
+    )
+    return after(theirs.predict_action_chunk(before(raw()), noise=observed()["noise"]))
+
+
+def main() -> None:
+    """Write what LeRobot computes, and print how far it is from what was written before."""
+    without_hub()
+    policy = their_policy()
+    results = {**network_results(policy.model), **way_results(policy)}
+    write("pi05", results)
+    with TemporaryDirectory() as folder:
+        off = deviation(exported_results(Path(folder)), results["way.commands"])
+        print(f"commands of our export {off:.1e}")
+        assert off <= TOLERANCE
+
+
+if __name__ == "__main__":
+    main()

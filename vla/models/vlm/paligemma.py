@@ -1,0 +1,203 @@
+"""PaliGemma with an expert for actions: a narrower Gemma whose layers attend to its keys and values too.
+
+The trunk of π0 (K. Black et al., "π0: A Vision-Language-Action Flow Model for General Robot Control", arXiv 2410.24164)
+and of π0.5 (Physical Intelligence, "π0.5: a Vision-Language-Action Model with Open-World Generalization", arXiv
+2504.16054). Attention is by blocks: images and sentence see each other, and the actions see them and each other.
+
+Shapes: B batch, C cameras, L tokens of the sentence, N tokens of any kind, P tokens of the prefix, k action chunk, A
+components of a padded action, E width of a token, H width of a head.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from transformers import GemmaConfig, GemmaModel, PaliGemmaConfig, PaliGemmaModel, SiglipVisionConfig
+
+from vla.io.errors import UserError
+from vla.io.types import Count, Layers, Width
+from vla.models.vlm.network import FlowNetwork, Prefix
+
+MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the time embedding
+NAMES = (  # of weights, published and here
+    ("paligemma_with_expert.paligemma.lm_head.", "paligemma.language_model.embed_tokens."),  # one matrix is both
+    ("paligemma_with_expert.paligemma.model.vision_tower.vision_model.", "paligemma.vision_tower."),
+    ("paligemma_with_expert.paligemma.model.", "paligemma."),
+    ("paligemma_with_expert.gemma_expert.model.", "expert."),
+    ("", ""),
+)
+TRUNK = (  # the same of PaliGemma alone
+    ("language_model.model.", "paligemma.language_model."),
+    ("vision_tower.vision_model.", "paligemma.vision_tower."),
+    ("multi_modal_projector.", "paligemma.multi_modal_projector."),
+)
+HEADS = ("model.", "")  # of published names: what LeRobot saves begins with the former, what openpi saves does not
+
+
+class PaliGemmaWithExpert(FlowNetwork):
+    """What π0 and π0.5 share: the trunk, the expert, and attention between them.
+
+    Args:
+        vocabulary: number of tokens of the sentence.
+        width, layers, heads, head_width, feedforward: of the language model; its heads share one key head.
+        vision_width, vision_layers, vision_heads, vision_feedforward: of the image encoder, a vision transformer.
+        resolution: height and width of an image [px].
+        patch: height and width of a patch, which becomes a token [px].
+        expert_width, expert_feedforward: of the expert, whose layers and heads are those of the language model.
+        action_width: A.
+
+    Raises:
+        UserError: sizes do not divide each other.
+    """
+
+    published = tuple((f"{head}{there}", here) for head in HEADS for there, here in NAMES)
+    pretrained = TRUNK
+    unused = tuple(f"{head}paligemma_with_expert.gemma_expert.lm_head." for head in HEADS)
+
+    def __init__(
+        self,
+        vocabulary: Count,
+        width: Width,
+        layers: Layers,
+        heads: Layers,
+        head_width: Width,
+        feedforward: Width,
+        vision_width: Width,
+        vision_layers: Layers,
+        vision_heads: Layers,
+        vision_feedforward: Width,
+        resolution: Count,
+        patch: Count,
+        expert_width: Width,
+        expert_feedforward: Width,
+        action_width: Width,
+    ) -> None:
+        super().__init__()
+        _require_multiple("vision_width", vision_width, "vision_heads", vision_heads)
+        _require_multiple("resolution", resolution, "patch", patch)
+        _require_multiple("head_width", head_width, "two", 2)
+        _require_multiple("expert_width", expert_width, "two", 2)
+        self.resolution, self.action_width, self.state_width = resolution, action_width, 0
+        shared = {"num_attention_heads": heads, "num_key_value_heads": 1, "head_dim": head_width}
+        shared |= {"num_hidden_layers": layers}
+        text = {**shared, "vocab_size": vocabulary, **_sizes(width, feedforward)}
+        vision = {"num_hidden_layers": vision_layers, "num_attention_heads": vision_heads, "patch_size": patch}
+        vision |= {"image_size": resolution, **_sizes(vision_width, vision_feedforward)}
+        self.paligemma = _trunk(text, vision)
+        self.expert = _expert({**shared, **_sizes(expert_width, expert_feedforward)})
+        self.action_in_proj = nn.Linear(action_width, expert_width)
+        self.action_out_proj = nn.Linear(expert_width, action_width)
+
+    def options(self) -> dict[str, Any]:
+        """Return LeRobot's options of this network, whose other sizes it does not let one choose."""
+        return {"image_resolution": [self.resolution] * 2}
+
+    def prefix(self, images: Tensor, cameras: Tensor, tokens: Tensor, sentence: Tensor, state: Tensor | None) -> Prefix:
+        """Encode images and sentence; what is absent is not seen, and positions do not count it."""
+        seen = self.paligemma.get_image_features(images.flatten(0, 1)).pooler_output.unflatten(0, images.shape[:2])
+        read = self.paligemma.language_model.embed_tokens(tokens)  # times the root of its width
+        present = torch.cat([cameras.repeat_interleave(seen.shape[2], 1), sentence], 1)
+        hidden = torch.cat([seen.flatten(1, 2), read], 1)
+        return self.attend(self.paligemma.language_model, hidden, present, None)[1]
+
+    def attend(
+        self, gemma: GemmaModel, hidden: Tensor, present: Tensor, prefix: Prefix | None, **condition: Tensor
+    ) -> tuple[Tensor, Prefix]:
+        """Pass tokens through the layers of a Gemma, in which they see each other and the prefix.
+
+        Args:
+            gemma: with layers like those of the trunk.
+            hidden: (B, N, E).
+            present: (B, N) bool, false for padding.
+            prefix: what else they see.
+            condition: further arguments of every layer.
+
+        Returns:
+            The tokens, (B, N, E), not normalised, and their keys and values as a prefix.
+        """
+        everything = present if prefix is None else torch.cat([prefix.present, present], 1)  # (B, P + N)
+        positions = everything.cumsum(1)[:, -hidden.shape[1] :] - 1
+        rotation = self.paligemma.language_model.rotary_emb(hidden, positions)
+        mask = everything[:, None, None, :].expand(-1, 1, hidden.shape[1], -1)
+        keys, values = [], []
+        for number, layer in enumerate(gemma.layers):
+            own = Own() if prefix is None else Own((prefix.keys[number], prefix.values[number]))
+            attention = {"attention_mask": mask, "position_embeddings": rotation, "past_key_values": own}
+            hidden = layer(hidden, **attention, **condition)
+            keys.append(own.keys)
+            values.append(own.values)
+        return hidden, Prefix(tuple(keys), tuple(values), present)
+
+
+class Own:
+    """Keys and values of the tokens of a layer, which attend to others before them too.
+
+    It is where transformers has a cache, and adds to none: a prefix stays as it is.
+
+    Args:
+        others: keys and values, (B, 1, P, H) each.
+    """
+
+    keys: Tensor
+    values: Tensor
+
+    def __init__(self, others: tuple[Tensor, Tensor] | None = None) -> None:
+        self._others = others
+
+    def update(self, keys: Tensor, values: Tensor, layer: int) -> tuple[Tensor, Tensor]:
+        """Keep (B, 1, N, H) keys and values, and return all that are seen."""
+        self.keys, self.values = keys, values
+        if self._others is None:
+            return keys, values
+        return torch.cat([self._others[0], keys], 2), torch.cat([self._others[1], values], 2)
+
+
+def _sizes(width: int, feedforward: int) -> dict[str, int]:
+    return {"hidden_size": width, "intermediate_size": feedforward}
+
+
+def _trunk(text: dict[str, Any], vision: dict[str, Any]) -> PaliGemmaModel:
+    """Build vision_tower, multi_modal_projector and language_model, without gradients of what no action depends on."""
+    encoder = SiglipVisionConfig(**vision, vision_use_head=False)
+    width = text["hidden_size"]
+    trunk = PaliGemmaModel(
+        PaliGemmaConfig(vision_config=encoder, text_config=GemmaConfig(**text), projection_dim=width)
+    )
+    # Actions see the keys and values of the last layer, and nothing that is made with them.
+    last = trunk.language_model.layers[-1]
+    for idle in (last.self_attn.q_proj, last.self_attn.o_proj, last.post_attention_layernorm, last.mlp):
+        idle.requires_grad_(False)
+    trunk.language_model.norm.requires_grad_(False)
+    return trunk
+
+
+def _expert(sizes: dict[str, int]) -> GemmaModel:
+    """Build the expert, whose input is no text."""
+    # Ids of the tokens of no text must be within its vocabulary, too.
+    expert = GemmaModel(GemmaConfig(**sizes, vocab_size=1, pad_token_id=0, bos_token_id=0, eos_token_id=0))
+    del expert.embed_tokens
+    return expert
+
+
+def joined(first: Prefix, second: Prefix) -> Prefix:
+    """Return a prefix of both, the second behind the first."""
+    keys, values = (
+        tuple(torch.cat(pair, 2) for pair in zip(*both, strict=True))
+        for both in ((first.keys, second.keys), (first.values, second.values))
+    )
+    return Prefix(keys, values, torch.cat([first.present, second.present], 1))
+
+
+def time_embedding(time: Tensor, width: int, precision: torch.dtype) -> Tensor:
+    """Embed times (…) in 0 … 1 as sines and cosines, (…, width), whose angles are computed in a `precision`."""
+    steps = torch.linspace(0, 1, width // 2, dtype=precision, device=time.device)
+    angles = time.unsqueeze(-1) * (1 / (MIN_PERIOD * (MAX_PERIOD / MIN_PERIOD) ** steps) * 2 * math.pi)
+    return torch.cat([angles.sin(), angles.cos()], -1)
+
+
+def _require_multiple(name: str, value: int, of: str, unit: int) -> None:
+    if value % unit:
+        raise UserError(f"model.network.{name}={value} must be a multiple of {of}, {unit}")

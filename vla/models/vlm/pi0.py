@@ -1,0 +1,49 @@
+"""π0: PaliGemma with an expert for actions, and a token of the robot state between prefix and actions.
+
+Shapes: see `vla.models.vlm.paligemma`; also S padded state.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from vla.io.types import Inherited, Width
+from vla.models.vlm.network import Prefix
+from vla.models.vlm.paligemma import PaliGemmaWithExpert, joined, time_embedding
+
+
+class PI0(PaliGemmaWithExpert):
+    """The network of π0. Every action is joined with the time before it enters the expert.
+
+    Args:
+        state_width: S.
+    """
+
+    kind = "pi0"
+
+    def __init__(self, state_width: Width, **inherited: Inherited) -> None:
+        super().__init__(**inherited)
+        self.state_width = state_width
+        width = self.action_in_proj.out_features
+        self.state_proj = nn.Linear(state_width, width)
+        self.action_time_mlp_in = nn.Linear(2 * width, width)
+        self.action_time_mlp_out = nn.Linear(width, width)
+
+    def prefix(self, images: Tensor, cameras: Tensor, tokens: Tensor, sentence: Tensor, state: Tensor | None) -> Prefix:
+        """Encode images and sentence, and then the state, in the expert: it sees them, but no actions."""
+        assert state is not None
+        known = super().prefix(images, cameras, tokens, sentence, None)
+        token = self.state_proj(state).unsqueeze(1)
+        return joined(known, self.attend(self.expert, token, sentence.new_ones(len(token), 1), known)[1])
+
+    def velocity(self, prefix: Prefix, noisy: Tensor, time: Tensor) -> Tensor:
+        """Predict the velocity of (B, k, A) noisy actions at times (B,) or (B, k)."""
+        hidden = self.action_in_proj(noisy)
+        # The angles of the highest frequency differ by 1e-4 in this precision, in which transformers has them.
+        clock = time_embedding(time.float(), hidden.shape[-1], torch.float32).to(hidden.dtype)
+        clock = (clock if time.dim() == 2 else clock.unsqueeze(1)).expand_as(hidden)
+        hidden = self.action_time_mlp_out(F.silu(self.action_time_mlp_in(torch.cat([hidden, clock], -1))))
+        hidden, _ = self.attend(self.expert, hidden, prefix.present.new_ones(noisy.shape[:2]), prefix)
+        return self.action_out_proj(self.expert.norm(hidden).float())
