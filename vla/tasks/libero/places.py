@@ -95,9 +95,9 @@ def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
         form = _Form(points, origin, turn)
         gaps, roofs = form.room(spots, rest)
         costs = away + 2 * np.maximum(0, MARGIN - gaps) + ROOFED * roofs
+        hands = spots + turned(turn) @ (at.hand - origin)
         if held:
             costs += STAY * np.minimum(np.linalg.norm(spots[:, :2] - origin[:2], axis=1), REACHED)
-            hands = spots + turned(turn) @ (at.hand - origin)
             costs += _hindrance(hands, at.yaw + turn, rest) + far(at, hands)
         one = int(np.argmin(costs))
         out = form.out(spots[one], rest, OBLIQUE) if roofs[one] else None
