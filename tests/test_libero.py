@@ -188,14 +188,16 @@ def test_the_planner_goes_on_from_where_another_agent_led() -> None:
 
 
 def test_the_truth_is_of_what_is_next() -> None:
+    def truth(seen: Observation) -> dict[str, Array]:
+        assert seen.truth is not None
+        return seen.truth
+
     with closing(world("task.suite=long", "task.tasks=[3]")) as environment, environment.blind():
         expert = Planner(spec=environment.spec)
         seen = environment.reset(1)
-        bowl = environment._scene.position("akita_black_bowl_1")
-        assert seen.truth is not None and np.array_equal(seen.truth["object"], bowl)
-        while not np.array_equal(seen.truth["object"], seen.truth["goal"]):  # the drawer, once the bowl is in it
+        assert np.array_equal(truth(seen)["object"], environment._scene.position("akita_black_bowl_1"))
+        while not np.array_equal(truth(seen)["object"], truth(seen)["goal"]):  # the drawer, once the bowl is in it
             seen = environment.step(expert.act(seen))
-            assert seen.truth is not None
         assert environment._goal.todo(environment._scene.data)[0][0] == "close"
 
 
