@@ -151,4 +151,4 @@ def export_pi05(folder: Path) -> None:
     """Write π0.5 with the statistics of `observed` as LeRobot has it, in `folder`/exported."""
     model = make_policy("pi05", write_tokenizer(folder))
     take_statistics(model)
-    LeRobotPolicyExporter(folder / "exported").export_policy(as_policy(model, SPEC))
+    LeRobotPolicyExporter(folder / "exported").export(as_policy(model, SPEC))
