@@ -46,6 +46,7 @@ TOGETHER = {
     ("evaluate", "lerobot"): ["task=metaworld"],
     **{(group, option): ["task=libero"] for group, option in (("validate", "libero"), ("evaluate", "libero_pro"))},
     ("tokenizer", "fast"): ["model=decoder"],
+    **{("policy/chunking", option): ["model=flow"] for option in ("guided", "guided_lerobot", "trained")},
     ("job", "deploy"): ["deploy=ros2"],
     ("task/robot", "file"): [
         *("task.robot.file=arm.xml", "task.robot.joints=[a]", "task.robot.home=[0.0]", "task.robot.tool=tcp"),
@@ -82,7 +83,8 @@ def test_deploying_nothing_is_refused() -> None:
 def test_option(group: str, option: str) -> None:
     top = group.partition("/")[0]
     job = [f"job={top}"] if top in ("export", "deploy") and option != "none" else []
-    check(composed(*TOGETHER.get((group, option), brought_by(group)), f"{group}={option}", *job))
+    plus = "+" if group == "policy/chunking" else ""
+    check(composed(*TOGETHER.get((group, option), brought_by(group)), f"{plus}{group}={option}", *job))
 
 
 def test_every_encoder_can_be_chosen_with_every_model() -> None:

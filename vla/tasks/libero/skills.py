@@ -80,12 +80,10 @@ def carry(at: Situation, thing: str, place: Place) -> Array:
 
 def let_go(at: Situation, thing: str) -> Array:
     """Let go of a held thing, but if it hangs askew only once what is below it has righted it."""
-    points, axes_of = at.points(thing), at.data.xmat[at.goal.bodies[thing]].reshape(3, 3)
-    axis = int(np.argmax(np.abs(axes_of[2])))
-    up = axes_of[:, axis] * np.sign(axes_of[2, axis])  # of the thing
-    standing = (
-        at.hand @ up - (points @ up).min()
-    )  # height of the hand over what the thing stands on once it is straight
+    points, frame = at.points(thing), at.data.xmat[at.goal.bodies[thing]].reshape(3, 3)
+    axis = int(np.argmax(np.abs(frame[2])))
+    up = frame[:, axis] * np.sign(frame[2, axis])  # of the thing
+    standing = at.hand @ up - (points @ up).min()  # height of the hand over the ground once the thing is straight
     hangs = up[2] < STRAIGHT and at.hand[2] - points[:, 2].min() > standing + 0.002
     return command(at, at.hand - (0.01 * UP if hangs else 0.0), at.yaw, 1.0 if hangs else -1.0, at.lean)
 
