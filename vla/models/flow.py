@@ -34,7 +34,7 @@ class Flow(DenoisingModel):
 
     continues = True
 
-    def __init__(self, prefix: Natural = 0, **inherited: Inherited) -> None:
+    def __init__(self, prefix: Natural, **inherited: Inherited) -> None:
         super().__init__(**inherited)
         self.prefix = prefix
         if prefix + self.execute > self.chunk:
