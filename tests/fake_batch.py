@@ -107,7 +107,7 @@ def make_act(**options: Any) -> ACT:
 
 def make_denoising(kind: type[DenoisingModel], **options: Any) -> DenoisingModel:
     """A small model that starts from noise."""
-    return _small(kind, "model/diffusion", {"chunk": 4, "layers": 2, "heads": 2, "copies": 8}, options)
+    return _small(kind, f"model/{kind.__name__.lower()}", {"chunk": 4, "layers": 2, "heads": 2, "copies": 8}, options)
 
 
 def as_policy(model: Model, spec: Spec = SPEC, **options: Any) -> Policy:
