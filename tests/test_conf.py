@@ -84,7 +84,8 @@ def test_option(group: str, option: str) -> None:
     top = group.partition("/")[0]
     job = [f"job={top}"] if top in ("export", "deploy") and option != "none" else []
     plus = "+" if group == "policy/chunking" else ""
-    check(composed(*TOGETHER.get((group, option), brought_by(group)), f"{plus}{group}={option}", *job))
+    together = TOGETHER[group, option] if (group, option) in TOGETHER else brought_by(group)
+    check(composed(*together, f"{plus}{group}={option}", *job))
 
 
 def test_every_encoder_can_be_chosen_with_every_model() -> None:
