@@ -21,7 +21,7 @@ from vla.tasks.libero.skills import approach, carry, command, drag, let_go, pull
 
 DRAWERS = ("wooden_cabinet", "white_cabinet", "yellow_cabinet")  # what must be open for something to be put in
 HOLLOWS = (*DRAWERS, "microwave")  # into which things are brought all the way
-ARRIVED = 0.01  # distance at which they are [m]
+ARRIVED = 0.015  # distance at which they are [m]
 NARROW = 0.006  # room about the hand below which a thing under something else is first dragged out [m]
 
 

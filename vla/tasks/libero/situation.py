@@ -18,7 +18,6 @@ SPACING = 0.015  # between points on surfaces [m]
 CUBE = 0.012  # edge of the cubes in which one point stands for all, where a thing is in the way [m]
 HELD = -0.3  # largest commanded opening at which the fingers press
 SHUT = -0.99  # largest commanded opening at which the fingers press as much as they can
-BETWEEN = 0.02  # largest distance from the hand of points of a thing between the fingers [m]
 THIN = 0.003  # least distance of fingers that hold something [m]
 WRIST = 2.7  # largest turn of the last joint either way, whose limit is 2.9 [rad]
 SMALL = 0.2  # turn that is done wherever the last joint is [rad]
@@ -119,7 +118,7 @@ class Situation:
         return next((thing for thing, root in self.goal.bodies.items() if root == owner), "")
 
     def touched(self) -> str | None:
-        """Return the movable thing that both fingers touch, or that is between closed fingers."""
+        """Return the movable thing that both fingers touch, or one of them when they are closed and yet apart."""
         bodies = self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]
         touched = []
         for fingers in self._fingers:
@@ -128,11 +127,7 @@ class Situation:
             touched.append(set(self.goal.owner[bodies[one][~mine[one]]].tolist()))
         shut = self.opening < SHUT and self.gap > THIN
         held = touched[0] | touched[1] if shut else touched[0] & touched[1]
-        things = {name: body for name, body in self.goal.bodies.items() if body in self._movable}
-        if shut and things and not held & self._movable:  # contacts come and go while a thing swings
-            gaps = {name: float(np.linalg.norm(self.points(name) - self.hand, axis=1).min()) for name in things}
-            return min(((gap, name) for name, gap in gaps.items() if gap < BETWEEN), default=(0.0, None))[1]
-        return next((name for name, body in things.items() if body in held), None)
+        return next((name for name, body in self.goal.bodies.items() if body in held and body in self._movable), None)
 
     def rests(self, thing: str) -> bool:
         """Return whether a thing touches another one that can be moved."""
