@@ -46,7 +46,10 @@ TOGETHER = {
     ("evaluate", "lerobot"): ["task=metaworld"],
     **{(group, option): ["task=libero"] for group, option in (("validate", "libero"), ("evaluate", "libero_pro"))},
     ("tokenizer", "fast"): ["model=decoder"],
-    **{("policy/chunking", option): ["model=flow"] for option in ("guided", "guided_lerobot", "trained")},
+    **{
+        ("policy/chunking", option): ["model=flow", "model.prefix=4"]
+        for option in ("guided", "guided_lerobot", "trained")
+    },
     ("job", "deploy"): ["deploy=ros2"],
     ("task/robot", "file"): [
         *("task.robot.file=arm.xml", "task.robot.joints=[a]", "task.robot.home=[0.0]", "task.robot.tool=tcp"),
