@@ -59,13 +59,18 @@ def test_a_training_is_the_same_bit_for_bit_after_an_estimate(name: str, folder:
         assert same(contents[0][part], contents[1][part]), part
 
 
-def test_it_is_said_before_and_compared_after(folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("scarce", [True, False])
+def test_it_is_said_before_and_compared_after(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, scarce: bool
+) -> None:
+    monkeypatch.setattr(estimate, "SCARCE", 0.0 if scarce else 1.0)
+    advice = r"; if that is too much, lower data\.batch_size \(now 8\), model\.context" if scarce else "$"
     with caplog.at_level(logging.INFO, logger=estimate.__name__):
         train(make_bc(), folder, tmp_path, Estimate(SIZES), steps=4, accumulate_grad_batches=2)
     said, took = (each.getMessage() for each in caplog.records if each.name == estimate.__name__)
     numbers = re.match(
         r"needs about ([\d.]+) of ([\d.]+) GB of memory, [\d.]+ of which it has, and [\d.]+ minutes for 8 batches of "
-        r"(\d+) ms, without validation; if that is too much, lower data\.batch_size \(now 8\), model\.context",
+        rf"(\d+) ms, without validation{advice}",
         said,
     )
     assert numbers, said

@@ -209,6 +209,8 @@ def test_published_weights_and_statistics_are_loaded(tmp_path: Path, tokenizer: 
     assert all(torch.equal(weight, theirs[name]) for name, weight in loaded.items())
     assert torch.equal(model.action_normalizer.std, ours.action_normalizer.std)
     assert isinstance(model.network, SmolVLA) and str(model.network.vlm.source).startswith(str(folder))
+    with pytest.raises(UserError, match=r"model\.statistics=pretrained takes those of a published policy"):
+        make_smolvla(tokenizer, statistics="pretrained").fit(steps(4), steps(3))
     model.fit(steps(4) + 5, steps(3) + 5)  # which are not asked for
     assert torch.equal(model.action_normalizer.mean, ours.action_normalizer.mean)
 

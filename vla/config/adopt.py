@@ -69,8 +69,8 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
         )
     if is_trunk(cfg.pretrained):
         return _with_trunk(cfg)
+    saved, improved = read_policy(cfg.pretrained).config, cfg.job == "improve"  # first: a wrong path is said as such
     parsed = _parsed(overrides, ("tokenizer", "model", "experiment"))
-    saved, improved = read_policy(cfg.pretrained).config, cfg.job == "improve"
     parts = (*REQUIRED_NODES, *OF_TRAINING) if improved else ("tokenizer", "model", "data")
     require_no_paths(saved, parts, cfg.pretrained, _given(parsed) if improved else None)
     values = _values(saved, parts)

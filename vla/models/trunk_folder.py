@@ -44,6 +44,6 @@ def _fetched(name: str, *patterns: str) -> Path:
         return fetch(repository, *patterns, revision=revision or None)
     except OSError as error:
         raise UserError(
-            f"{name} cannot be fetched from the Hugging Face hub ({error}): give the folder of a download, or random "
-            "weights with model.trunk=null"
+            f"{name} cannot be fetched from the Hugging Face hub ({error}): give the folder of a download, or leave it "
+            "out for random weights"
         ) from error

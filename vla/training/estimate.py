@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 
 TRIALS_S, MANY = 2.0, 500  # trials of larger batches end after this time [s], unless a training has so many batches
 TOLERANCE = 1.15  # a training is refused if it needs that much more than there is
+SCARCE = 0.5  # share of the memory above which a training says what to lower
 OPTIMIZED = 20_000_000  # numbers that a step of the optimiser is timed with
 FIRST_STEP = 40e6  # of memory that libraries take for the first step, measured for four models [bytes]
 GB = 1e9
@@ -105,12 +106,12 @@ class Estimate(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Say what was estimated, for the steps that are left."""
         batches = batches_left(trainer)
+        scarce = self.memory > SCARCE * self._available
+        advice = f"; if that is too much, {what_to_lower(self._config)}" if scarce else ""
         whole = f"{batches * self.seconds / 60:.1f} minutes for {batches} batches" if batches >= 0 else "batches"
         log.info(
-            "needs about %.2f of %.1f GB of memory, %.2f of which it has, and %s of %.0f ms, without validation; "
-            "if that is too much, %s",
-            *(self.memory / GB, self._available / GB, self._held / GB, whole, 1000 * self.seconds),
-            what_to_lower(self._config),
+            "needs about %.2f of %.1f GB of memory, %.2f of which it has, and %s of %.0f ms, without validation%s",
+            *(self.memory / GB, self._available / GB, self._held / GB, whole, 1000 * self.seconds, advice),
         )
         reset_peak(pl_module.device)
 

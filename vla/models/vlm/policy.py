@@ -102,10 +102,15 @@ class VisionLanguageAction(Model):
         self.register_buffer("noise", noise, persistent=False)
 
     def fit(self, states: np.ndarray, actions: np.ndarray) -> None:
-        """Normalise by the statistics of (N, P) states and (N, D) actions, unless they are those of the trunk."""
+        """Normalise by the statistics of (N, P) states and (N, D) actions, unless they are those of the trunk
+        (UserError: it has none)."""
         if self.statistics == "demonstrations":
             self.state_normalizer.fit(states[:, self.spec.pose])
             self.action_normalizer.fit(actions)
+        elif not self.action_normalizer.known:
+            raise UserError(
+                "model.statistics=pretrained takes those of a published policy: add pretrained=…, or leave that out"
+            )
 
     def sample_noise(self, random: torch.Generator) -> Tensor:
         """Sample standard normal noise, (1, k, A)."""
