@@ -60,6 +60,14 @@ def test_a_report_without_room_costs_no_episode(tmp_path: Path, whole: dict[str,
     assert reported(tmp_path / "run") == whole
 
 
+def test_two_processes_do_not_evaluate_in_one_folder(tmp_path: Path, whole: dict[str, Any]) -> None:
+    with Played(tmp_path / "run", {}):
+        refused = here(tmp_path, *COMMAND, "output=run", ok=False)
+    assert "another process evaluates in" in refused.stderr and "choose another output=DIR" in refused.stderr
+    here(tmp_path, *COMMAND, "output=run")
+    assert reported(tmp_path / "run") == whole
+
+
 def test_only_episodes_that_ended_in_an_error_are_played_again(tmp_path: Path, whole: dict[str, Any]) -> None:
     act = Perturbed.act
 

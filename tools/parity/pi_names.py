@@ -23,9 +23,9 @@ SOURCE = "{name} of LeRobot 0.6.1 at its published sizes, without the embeddings
 PUBLISHED = {  # class → repository, and what is known of its file
     PI0Pytorch: (
         "pi0_base",
-        "LeRobot's issues #2291 and #3109 quote names, 777 tensors, no embeddings.",
+        "LeRobot's threads 2291 and 3109 quote names, 777 tensors, no embeddings.",
     ),
-    PI05Pytorch: ("pi05_base", "LeRobot's issue #2307 tells of the embeddings; a descendant has 812 tensors."),
+    PI05Pytorch: ("pi05_base", "LeRobot's thread 2307 tells of the embeddings; a descendant has 812 tensors."),
 }
 
 

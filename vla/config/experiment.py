@@ -313,7 +313,15 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
         require_no_paths({**saved.config, "model": _model_node(saved.config, saved, weights=True)}, PARTS, checkpoint)
     model = _model(saved.config, saved.spec, saved, weights=True)
     saved.restore(model)
-    return build(policy, "policy", model=model, spec=saved.spec)
+    try:
+        return build(policy, "policy", model=model, spec=saved.spec)
+    except RuntimeError as error:  # torch.OutOfMemoryError, or one of CUDA itself
+        if "out of memory" not in str(error):
+            raise
+        raise UserError(
+            "the GPU has too little memory for a policy in every process: lower cluster.workers, as in "
+            "cluster.workers=8, share one with cluster.policy=here, or set policy.device=cpu"
+        ) from error
 
 
 def training_policy(precision: str, model: Model) -> Policy:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import signal
 import time
 from collections.abc import Callable, Sequence
 from multiprocessing.process import BaseProcess
@@ -135,7 +133,7 @@ class DemoOperator(Operator):
 
     def __init__(self, node: Any, topic: str, stopped: Event, agent: BaseProcess, simulator: BaseProcess) -> None:
         super().__init__(node, topic, (agent, simulator))
-        self.stopped, self._simulator = stopped, simulator
+        self.stopped = stopped
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         node.create_subscription(String, f"{SIMULATOR}/episode", self._on_episode, latched)
         self._episode: SimulatedEpisode | None = None
@@ -161,18 +159,6 @@ class DemoOperator(Operator):
         self.wait(lambda: self._playing, "an episode")
         assert self._episode is not None
         self._words.publish(String(data=self._episode.instruction))
-
-    def watchdog_delay(self) -> float:
-        """Suspend the simulator until the agent holds the arm; returns the delay [s]."""
-        assert self._simulator.pid is not None
-        self.wait(lambda: self.values.get("state") == "running", "the agent to run")
-        os.kill(self._simulator.pid, signal.SIGSTOP)
-        started = time.monotonic()
-        try:
-            self.wait(lambda: self.values["state"] == "holding", "the agent to hold")
-            return time.monotonic() - started
-        finally:
-            os.kill(self._simulator.pid, signal.SIGCONT)
 
     @property
     def _playing(self) -> bool:

@@ -10,10 +10,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
+from filelock import FileLock, Timeout
+
 from vla.io.documents import parse_json, read_bounded
+from vla.io.errors import UserError
 from vla.io.files import write_text, writing
 from vla.rollouts.results import Result
 
+LOCK = ".evaluation"  # held by the process that evaluates into a run's folder
 PLAYED = "played.jsonl"  # exists in a run's folder while an evaluation has no report yet
 LARGEST = 4 << 30  # of that file [bytes], millions of episodes
 
@@ -28,8 +32,16 @@ class Played:
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
         """Continue the file in a run's folder if its first line is `head`, what determines the episodes; else begin it.
 
-        An OSError tells that it cannot be written.
+        An OSError tells that it cannot be written, a UserError that another process writes it.
         """
+        folder.mkdir(parents=True, exist_ok=True)
+        self._lock = FileLock(folder / LOCK, blocking=False)
+        try:
+            self._lock.acquire()
+        except Timeout as error:
+            raise UserError(
+                f"another process evaluates in {folder}: wait for it, or choose another output=DIR"
+            ) from error
         self._path, lines = folder / PLAYED, [_line(head)]
         self.results = defaultdict[str, dict[int, Result]](dict)  # condition → seed → result
         before = read_bounded(self._path, LARGEST).decode("utf-8", "replace") if self._path.is_file() else ""
@@ -49,9 +61,11 @@ class Played:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Remove the file, unless it has something to continue with."""
+        """Remove the file, unless it has something to continue with, and let others evaluate."""
         if kind is None or not any(self.results.values()):
             self._path.unlink(missing_ok=True)
+        Path(self._lock.lock_file).unlink(missing_ok=True)  # while it is held: who comes later makes a new one
+        self._lock.release()
 
     def add(self, condition: str, result: Result) -> None:
         """Write the result of another episode; an OSError if the file cannot be written."""

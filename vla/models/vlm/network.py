@@ -6,11 +6,17 @@ an action as the network has them, padded.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from typing import Any, ClassVar, NamedTuple
 
+import torch
 from torch import Tensor, nn
+
+from vla.io.errors import UserError
+
+MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the embedding of a time
 
 
 class Prefix(NamedTuple):
@@ -72,3 +78,28 @@ def renamed(name: str, beginnings: Iterable[tuple[str, str]]) -> str:
         if name.startswith(theirs):
             return ours + name.removeprefix(theirs)
     return name
+
+
+def time_embedding(time: Tensor, width: int, precision: torch.dtype) -> Tensor:
+    """Embed times (…) in 0 … 1 as sines and cosines, (…, width), whose angles are computed in a `precision`."""
+    steps = torch.linspace(0, 1, width // 2, dtype=precision, device=time.device)
+    angles = time.unsqueeze(-1) * (1 / (MIN_PERIOD * (MAX_PERIOD / MIN_PERIOD) ** steps) * 2 * math.pi)
+    return torch.cat([angles.sin(), angles.cos()], -1)
+
+
+def with_time(hidden: Tensor, time: Tensor, mix: tuple[nn.Module, nn.Module], precision: torch.dtype) -> Tensor:
+    """Join (B, k, F) actions with their times, (B,) or (B, k), by an MLP of two layers; (B, k, F)."""
+    clock = time_embedding(time, hidden.shape[-1], precision).to(hidden.dtype)
+    clock = (clock if time.dim() == 2 else clock.unsqueeze(1)).expand_as(hidden)
+    return mix[1](nn.functional.silu(mix[0](torch.cat([hidden, clock], -1))))
+
+
+def sizes(width: int, feedforward: int) -> dict[str, int]:
+    """Return the sizes of the layers of a transformer under the names that transformers has for them."""
+    return {"hidden_size": width, "intermediate_size": feedforward}
+
+
+def require_multiple(name: str, value: int, of: str, unit: int) -> None:
+    """Raise a UserError unless a size is a multiple of another."""
+    if value % unit:
+        raise UserError(f"model.network.{name}={value} must be a multiple of {of}, {unit}")

@@ -10,18 +10,15 @@ components of a padded action, E width of a token, H width of a head.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from transformers import GemmaConfig, GemmaModel, PaliGemmaConfig, PaliGemmaModel, SiglipVisionConfig
 
-from vla.io.errors import UserError
 from vla.io.types import Count, Layers, Width
-from vla.models.vlm.network import FlowNetwork, Prefix
+from vla.models.vlm.network import FlowNetwork, Prefix, require_multiple, sizes
 
-MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the time embedding
 NAMES = (  # of weights, published and here
     ("paligemma_with_expert.paligemma.lm_head.", "paligemma.language_model.embed_tokens."),  # one matrix is both
     ("paligemma_with_expert.paligemma.model.vision_tower.vision_model.", "paligemma.vision_tower."),
@@ -76,18 +73,18 @@ class PaliGemmaWithExpert(FlowNetwork):
         action_width: Width,
     ) -> None:
         super().__init__()
-        _require_multiple("vision_width", vision_width, "vision_heads", vision_heads)
-        _require_multiple("resolution", resolution, "patch", patch)
-        _require_multiple("head_width", head_width, "two", 2)
-        _require_multiple("expert_width", expert_width, "two", 2)
+        require_multiple("vision_width", vision_width, "vision_heads", vision_heads)
+        require_multiple("resolution", resolution, "patch", patch)
+        require_multiple("head_width", head_width, "two", 2)
+        require_multiple("expert_width", expert_width, "two", 2)
         self.resolution, self.action_width, self.state_width = resolution, action_width, 0
         shared = {"num_attention_heads": heads, "num_key_value_heads": 1, "head_dim": head_width}
         shared |= {"num_hidden_layers": layers}
-        text = {**shared, "vocab_size": vocabulary, **_sizes(width, feedforward)}
+        text = {**shared, "vocab_size": vocabulary, **sizes(width, feedforward)}
         vision = {"num_hidden_layers": vision_layers, "num_attention_heads": vision_heads, "patch_size": patch}
-        vision |= {"image_size": resolution, **_sizes(vision_width, vision_feedforward)}
+        vision |= {"image_size": resolution, **sizes(vision_width, vision_feedforward)}
         self.paligemma = _trunk(text, vision)
-        self.expert = _expert({**shared, **_sizes(expert_width, expert_feedforward)})
+        self.expert = _expert({**shared, **sizes(expert_width, expert_feedforward)})
         self.action_in_proj = nn.Linear(action_width, expert_width)
         self.action_out_proj = nn.Linear(expert_width, action_width)
 
@@ -155,10 +152,6 @@ class Own:
         return torch.cat([self._others[0], keys], 2), torch.cat([self._others[1], values], 2)
 
 
-def _sizes(width: int, feedforward: int) -> dict[str, int]:
-    return {"hidden_size": width, "intermediate_size": feedforward}
-
-
 def _trunk(text: dict[str, Any], vision: dict[str, Any]) -> PaliGemmaModel:
     """Build vision_tower, multi_modal_projector and language_model, without gradients of what no action depends on."""
     encoder = SiglipVisionConfig(**vision, vision_use_head=False)
@@ -189,15 +182,3 @@ def joined(first: Prefix, second: Prefix) -> Prefix:
         for both in ((first.keys, second.keys), (first.values, second.values))
     )
     return Prefix(keys, values, torch.cat([first.present, second.present], 1))
-
-
-def time_embedding(time: Tensor, width: int, precision: torch.dtype) -> Tensor:
-    """Embed times (…) in 0 … 1 as sines and cosines, (…, width), whose angles are computed in a `precision`."""
-    steps = torch.linspace(0, 1, width // 2, dtype=precision, device=time.device)
-    angles = time.unsqueeze(-1) * (1 / (MIN_PERIOD * (MAX_PERIOD / MIN_PERIOD) ** steps) * 2 * math.pi)
-    return torch.cat([angles.sin(), angles.cos()], -1)
-
-
-def _require_multiple(name: str, value: int, of: str, unit: int) -> None:
-    if value % unit:
-        raise UserError(f"model.network.{name}={value} must be a multiple of {of}, {unit}")

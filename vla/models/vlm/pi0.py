@@ -6,12 +6,11 @@ Shapes: see `vla.models.vlm.paligemma`; also S padded state.
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.io.types import Inherited, Width
-from vla.models.vlm.network import Prefix
-from vla.models.vlm.paligemma import PaliGemmaWithExpert, joined, time_embedding
+from vla.models.vlm.network import Prefix, with_time
+from vla.models.vlm.paligemma import PaliGemmaWithExpert, joined
 
 
 class PI0(PaliGemmaWithExpert):
@@ -42,8 +41,6 @@ class PI0(PaliGemmaWithExpert):
         """Predict the velocity of (B, k, A) noisy actions at times (B,) or (B, k)."""
         hidden = self.action_in_proj(noisy)
         # The angles of the highest frequency differ by 1e-4 in this precision, in which transformers has them.
-        clock = time_embedding(time.float(), hidden.shape[-1], torch.float32).to(hidden.dtype)
-        clock = (clock if time.dim() == 2 else clock.unsqueeze(1)).expand_as(hidden)
-        hidden = self.action_time_mlp_out(F.silu(self.action_time_mlp_in(torch.cat([hidden, clock], -1))))
+        hidden = with_time(hidden, time.float(), (self.action_time_mlp_in, self.action_time_mlp_out), torch.float32)
         hidden, _ = self.attend(self.expert, hidden, prefix.present.new_ones(noisy.shape[:2]), prefix)
         return self.action_out_proj(self.expert.norm(hidden).float())

@@ -14,8 +14,8 @@ from transformers import GemmaConfig
 from transformers.models.gemma.modeling_gemma import GemmaAttention, GemmaMLP
 
 from vla.io.types import Inherited
-from vla.models.vlm.network import Prefix
-from vla.models.vlm.paligemma import PaliGemmaWithExpert, time_embedding
+from vla.models.vlm.network import Prefix, time_embedding
+from vla.models.vlm.paligemma import PaliGemmaWithExpert
 
 
 class PI05(PaliGemmaWithExpert):

@@ -17,12 +17,10 @@ from torch import Tensor, nn
 from transformers import LlamaConfig, LlamaModel, SmolVLMConfig, SmolVLMModel
 from transformers.models.llama.modeling_llama import LlamaAttention, apply_rotary_pos_emb
 
-from vla.io.errors import UserError
 from vla.io.types import Count, Layers, Width
-from vla.models.vlm.network import FlowNetwork, Prefix
+from vla.models.vlm.network import FlowNetwork, Prefix, require_multiple, sizes, with_time
 
 ROPE_BASE = 10_000.0  # of the policy, whatever that of the language model was
-MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the time embedding
 EPSILON = 1e-5  # of RMS norms
 NO_TOKENS: dict[str, None] = {"bos_token_id": None, "eos_token_id": None}  # nothing is generated
 
@@ -84,18 +82,18 @@ class SmolVLA(FlowNetwork):
         action_width: Width,
     ) -> None:
         super().__init__()
-        _require_multiple("heads", heads, "key_heads", key_heads)
-        _require_multiple("vision_width", vision_width, "vision_heads", vision_heads)
-        _require_multiple("resolution", resolution, "patch times shuffle", patch * shuffle)
-        _require_multiple("head_width", head_width, "two", 2)
-        _require_multiple("expert_width", expert_width, "two", 2)
+        require_multiple("heads", heads, "key_heads", key_heads)
+        require_multiple("vision_width", vision_width, "vision_heads", vision_heads)
+        require_multiple("resolution", resolution, "patch times shuffle", patch * shuffle)
+        require_multiple("head_width", head_width, "two", 2)
+        require_multiple("expert_width", expert_width, "two", 2)
         self.resolution, self.state_width, self.action_width = resolution, state_width, action_width
         self.head_width, self.joint_every = head_width, joint_every
         attention = {"num_attention_heads": heads, "num_key_value_heads": key_heads, "head_dim": head_width}
         shared = {**attention, "num_hidden_layers": layers, "rms_norm_eps": EPSILON, **NO_TOKENS}
-        text = {**shared, "vocab_size": vocabulary, **_sizes(width, feedforward)}
+        text = {**shared, "vocab_size": vocabulary, **sizes(width, feedforward)}
         vision = {"num_hidden_layers": vision_layers, "num_attention_heads": vision_heads, "patch_size": patch}
-        vision |= {"image_size": resolution, **_sizes(vision_width, vision_feedforward)}
+        vision |= {"image_size": resolution, **sizes(vision_width, vision_feedforward)}
         self.vlm = _trunk(text, vision, shuffle)
         self.expert = _expert(shared, joint_every, expert_width, expert_feedforward)
         self.state_proj = nn.Linear(state_width, width)
@@ -132,9 +130,7 @@ class SmolVLA(FlowNetwork):
     def velocity(self, prefix: Prefix, noisy: Tensor, time: Tensor) -> Tensor:
         """Predict the velocity of (B, k, A) noisy actions at times (B,) or (B, k)."""
         hidden, count = self.action_in_proj(noisy), noisy.shape[1]
-        clock = time_embedding(time, hidden.shape[-1]).to(hidden.dtype)
-        clock = (clock if time.dim() == 2 else clock.unsqueeze(1)).expand_as(hidden)
-        hidden = self.action_time_mlp_out(F.silu(self.action_time_mlp_in(torch.cat([hidden, clock], -1))))
+        hidden = with_time(hidden, time, (self.action_time_mlp_in, self.action_time_mlp_out), torch.float64)
         places = torch.arange(count, device=noisy.device)
         after = rotation_of(prefix.present.sum(1, keepdim=True) + places, self.head_width)
         first = rotation_of(places.unsqueeze(0), self.head_width)
@@ -197,10 +193,6 @@ class Kept:
         return keys, values
 
 
-def _sizes(width: int, feedforward: int) -> dict[str, int]:
-    return {"hidden_size": width, "intermediate_size": feedforward}
-
-
 def _trunk(text: dict[str, Any], vision: dict[str, Any], shuffle: int) -> SmolVLMModel:
     """Build vision_model, connector and text_model."""
     config = SmolVLMConfig(text_config={"model_type": "llama", **text}, vision_config=vision, scale_factor=shuffle)
@@ -210,7 +202,7 @@ def _trunk(text: dict[str, Any], vision: dict[str, Any], shuffle: int) -> SmolVL
 def _expert(shared: dict[str, Any], joint_every: int, width: int, feedforward: int) -> LlamaModel:
     """Build the expert, whose input is no text."""
     # Heads need not fill its width, which the check of its configuration demands.
-    config = LlamaConfig(**shared, vocab_size=1, **_sizes(shared["num_attention_heads"], feedforward))
+    config = LlamaConfig(**shared, vocab_size=1, **sizes(shared["num_attention_heads"], feedforward))
     config.hidden_size = width
     expert = LlamaModel(config)
     del expert.embed_tokens
@@ -226,18 +218,6 @@ def rotation_of(positions: Tensor, width: int) -> Rotation:
     return angles.cos(), angles.sin()
 
 
-def time_embedding(time: Tensor, width: int) -> Tensor:
-    """Embed times (…) in 0 … 1 as sines and cosines, (…, width) float64."""
-    steps = torch.linspace(0, 1, width // 2, dtype=torch.float64, device=time.device)
-    angles = time.unsqueeze(-1) * (1 / (MIN_PERIOD * (MAX_PERIOD / MIN_PERIOD) ** steps) * 2 * math.pi)
-    return torch.cat([angles.sin(), angles.cos()], -1)
-
-
 def _flat(by_head: Tensor) -> Tensor:
     """Join the heads of (B, heads, N, H)."""
     return by_head.transpose(1, 2).flatten(2)
-
-
-def _require_multiple(name: str, value: int, of: str, unit: int) -> None:
-    if value % unit:
-        raise UserError(f"model.network.{name}={value} must be a multiple of {of}, {unit}")
