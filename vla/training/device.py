@@ -22,17 +22,21 @@ def now(device: torch.device) -> float:
 
 
 def memory_of(device: torch.device) -> tuple[float, float]:
-    """Return the memory that this process holds, and that it can get [bytes]."""
+    """Return the memory that this process holds, and that it can get [bytes]; see `peak`."""
     if device.type == "cuda":
         return torch.cuda.memory_allocated(device), torch.cuda.mem_get_info(device)[0]
-    return psutil.Process().memory_info().rss, free_memory() * memory()
+    return psutil.Process().memory_info().rss - _of_files(), free_memory() * memory()
 
 
 def peak(device: torch.device) -> float:
-    """Return the largest memory of this process since `reset_peak` [bytes]."""
+    """Return the largest memory of this process since `reset_peak` [bytes].
+
+    On Linux without pages of files, such as those of a store that were read: the system takes them back when needed.
+    """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return largest - _of_files()
 
 
 def reset_peak(device: torch.device) -> None:
@@ -40,3 +44,8 @@ def reset_peak(device: torch.device) -> None:
         torch.cuda.reset_peak_memory_stats(device)
     with suppress(OSError):  # elsewhere, and where it is forbidden, the largest of the whole process counts
         Path("/proc/self/clear_refs").write_text("5")
+
+
+def _of_files() -> int:
+    """Return the memory of this process that shows files [bytes]; 0 where that is unknown."""
+    return getattr(psutil.Process().memory_info(), "shared", 0)
