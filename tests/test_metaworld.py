@@ -57,6 +57,19 @@ def test_a_seed_is_the_same_episode_whatever_came_before() -> None:
     environment.close()
 
 
+@pytest.mark.parametrize("task", ["stick-push", "stick-pull"])
+def test_what_nobody_touches_stands_still(task: str) -> None:
+    environment = world(f"task.tasks=[{task}]")
+    before = environment.reset(0)
+    for _ in range(10):
+        after = environment.step(np.zeros(4))
+    assert before.truth is not None and after.truth is not None
+    thermos = slice(11, 14)
+    moved = after.truth["observation"][thermos] - before.truth["observation"][thermos]
+    assert np.abs(moved).max() < 0.002  # [m]
+    environment.close()
+
+
 def test_tasks_are_compiled_again_where_memory_is_scarce(monkeypatch: pytest.MonkeyPatch) -> None:
     compiled: list[str] = []
     environment = world("task.tasks=[coffee-push,door-open,stick-pull]")

@@ -11,7 +11,7 @@ from PIL import Image
 
 from vla.io.errors import UserError
 from vla.spec import Array
-from vla.tasks.metaworld.package import simulator
+from vla.tasks.metaworld.package import simulator, stop_sliding
 from vla.tasks.rendering.renderer import WHOLE, Renderer, RendererFactory, Views
 
 HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the optical axis, quaternion wxyz
@@ -72,6 +72,7 @@ class TaskScene:
         goal."""
         self.simulator.seed(seed)
         observation, _ = self.simulator.reset()
+        stop_sliding(self.simulator)
         # Some tasks move bodies after the last step of physics: without this the first observation and picture still
         # have objects and goals where the episode before, or the model's file, has them.
         mujoco.mj_kinematics(self.model, self.simulator.data)
