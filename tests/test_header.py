@@ -13,6 +13,7 @@ from toy_episodes import EPISODES, add
 
 from vla.data.episodes import EpisodeStore
 from vla.data.index import index_line
+from vla.io.parts import Part
 from vla.spec import LONGEST_INSTRUCTION, Spec
 
 NAN = float("nan")
@@ -114,5 +115,14 @@ def test_what_could_not_be_read_back_is_not_stored(tmp_path: Path) -> None:
 
 def test_a_spec_comes_back_as_it_was() -> None:
     assert Spec.from_dict(ARM_SPEC.to_dict()) == ARM_SPEC
+    for part, says in (
+        (Part("roof"), "parts names roof, which is not among the cameras"),
+        (Part("wrist", (0.5, 0.0, 0.5, 1.0)), r"the window of wrist is \(0\.5, 0\.0, 0\.5, 1\.0\), not top, left"),
+        (Part("wrist", (0.5, 0.5, 1.5, 1.5)), "the window of wrist ends outside the picture"),
+        (Part("wrist", point=("x", "y", "z")), "the part of wrist moves with x, y, z, which is not in the state"),
+        (Part("wrist", point=("joint1", "joint2", "joint3")), "the part of wrist needs three names in point, and 3 a"),
+    ):
+        with pytest.raises(ValueError, match=rf"^the spec is damaged or of another kind: {says}"):
+            Spec.from_dict(replace(ARM_SPEC, parts=(part,)).to_dict())
     with pytest.raises(ValueError, match=r"^x\.ckpt is damaged or of another kind: .*set"):
         Spec.from_dict({**ARM_SPEC.to_dict(), "cameras": {1}}, "x.ckpt")

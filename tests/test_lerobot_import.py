@@ -46,6 +46,7 @@ from vla.data.episodes import EpisodeStore
 from vla.data.formats import lerobot_tables as tables
 from vla.data.formats.lerobot_images import decode, encode, require_video
 from vla.data.formats.lerobot_import import LeRobotDemonstrations
+from vla.io.parts import Part
 from vla.spec import Spec
 
 NAN = float("nan")
@@ -329,7 +330,7 @@ def test_differences_from_the_task_are_named(home: Path, spec: Spec, says: str) 
 
 
 def test_what_fits_the_task_nearly_is_taken_and_a_whole_picture_is_no_part_of_one(home: Path) -> None:
-    cut = replace(ARM_SPEC, cut=("wrist",))
+    cut = replace(ARM_SPEC, parts=(Part("wrist"),))
     for spec in (replace(ARM_SPEC, control_hz=9.99), cut):  # images of the size of the task were cut
         assert len(demonstrations(home / "dataset", spec)) == 3
     with pytest.raises(ValueError, match=r"wrist of \S+ has 16 by 16 pixels, but wrist shows a part of a larger pict"):

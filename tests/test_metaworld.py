@@ -23,7 +23,7 @@ from vla.deploy.client_observation import Keys
 from vla.parallel.pool import THIS_PROCESS
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import rollout
-from vla.spec import Array, Multitask
+from vla.spec import Array, Multitask, Spec
 from vla.tasks.metaworld import package
 from vla.tasks.metaworld.environment import MetaWorld, _command
 from vla.tasks.metaworld.expert import Scripted
@@ -232,6 +232,23 @@ def test_images_that_are_parts_of_a_picture_are_not_taken_from_whole_ones() -> N
     for key, camera in (("image", "corner2"), ("hand", "hand")):
         with pytest.raises(ValueError, match=f"^{key} has 480 by 480 pixels, but {camera} shows a part of .*96 by 96"):
             keys.observation({**sent, key: whole}, spec)
+
+
+def test_anybody_who_has_lerobots_picture_and_the_state_gives_the_images_of_the_policy() -> None:
+    chosen = "task.tasks=[pick-place,door-open]", "task.cameras=[corner2,hand]", "task/renderer=mujoco"
+    wide = world(chosen[0], "task.image_size=[480,480]", chosen[2])
+    ours = world(*chosen, "task.drawn=480", "task.image_size=[96,96]", "task.window=[0.25,0.29,0.95,0.99]")
+    keys = Keys({"picture": "image"}, ["state"], "prompt")
+    assert keys.cameras(ours.spec) == ["picture"] and keys.cameras(wide.spec) == ["corner2"]
+    for seed in (0, 1):
+        for whole, cut in zip(played(wide, seed, 12), played(ours, seed, 12), strict=True):
+            sent = {"image": whole.rgb["corner2"], "state": whole.state, "prompt": whole.instruction}
+            shown = ours.spec.images(keys.observation(sent, ours.spec))
+            for camera in ("corner2", "hand"):
+                np.testing.assert_array_equal(shown[camera], cut.rgb[camera])
+    assert Spec.from_dict(ours.spec.to_dict()) == ours.spec
+    wide.close()
+    ours.close()
 
 
 def test_the_hands_picture_is_a_part_of_lerobots_that_moves_along() -> None:

@@ -22,6 +22,7 @@ from vla.deploy import messages
 from vla.deploy.client_observation import Keys
 from vla.deploy.inference import Inference
 from vla.io.images import resize
+from vla.io.parts import Part
 from vla.models.model import Model
 from vla.models.transforms import Fit, Resize
 
@@ -126,6 +127,6 @@ def test_one_raw_observation_is_the_same_input_everywhere(
 def test_a_world_with_another_size_of_images_fits_unless_they_are_cut_out() -> None:
     TRAINED.require_input(replace(RAW, truth=()), "the policy", "the task")
     with pytest.raises(ValueError, match="the policy has image_size"):
-        replace(TRAINED, cut=("eye",)).require_input(RAW, "the policy", "the task")
+        replace(TRAINED, parts=(Part("eye"),)).require_input(RAW, "the policy", "the task")
     with pytest.raises(ValueError, match="the policy has control_hz"):
         TRAINED.require_input(replace(RAW, control_hz=5.0), "the policy", "the task")

@@ -263,7 +263,10 @@ class Policy:
         Raises:
             UserError: the observation does not match the spec.
         """
-        spec, rgb = self.spec, observation.rgb
+        spec = self.spec
+        if observation.state.shape != (len(spec.state),):
+            raise UserError(f"the policy's state is {spec.state}, the observation's {observation.state.shape}")
+        rgb = spec.images(observation)
         if missing := [camera for camera in spec.cameras if camera not in rgb]:
             raise UserError(f"the policy needs cameras {spec.cameras}, the observation lacks {', '.join(missing)}")
         for camera in spec.cameras:
@@ -272,8 +275,6 @@ class Policy:
                 kind = f"{image.dtype} of {image.shape}"
                 raise UserError(f"the image of {camera} must be (H, W, 3) uint8, 0 to 255, and is {kind}")
             spec.require_cut(camera, image.shape, f"the image of {camera}")
-        if observation.state.shape != (len(spec.state),):
-            raise UserError(f"the policy's state is {spec.state}, the observation's {observation.state.shape}")
         frame = {
             "rgb": {camera: self._tensor(rgb[camera]) for camera in spec.cameras},
             "state": self._tensor(np.asarray(observation.state, np.float32)),

@@ -16,6 +16,7 @@ from annotated_types import Ge, Le, MaxLen, MinLen, Predicate
 
 from vla.io.documents import STRICT, parse_plain
 from vla.io.errors import UserError
+from vla.io.parts import PICTURE, Part, with_parts
 from vla.io.types import Count, Point, Positive, names_a_file, unique
 
 Array = np.ndarray
@@ -72,11 +73,15 @@ class Spec:
     high: Numbers  # (D,) largest action
     control_hz: Positive  # [Hz]
     depth: Annotated[tuple[Camera, ...], MaxLen(100), Predicate(unique)] = ()  # the cameras that also give depth
-    # The cameras whose images the world cuts out of larger pictures, which others cannot take their place.
-    cut: Annotated[tuple[Camera, ...], MaxLen(100), Predicate(unique)] = ()
+    parts: Annotated[tuple[Part, ...], MaxLen(100)] = ()  # where cameras show parts of a larger picture
     # simulator state kept as an auxiliary training target: name, size
     truth: Annotated[tuple[tuple[Name, Count], ...], MaxLen(100)] = ()
     robot: RobotModel | None = None  # None: no kinematics and no deployment
+
+    @property
+    def cut(self) -> tuple[str, ...]:
+        """The cameras whose images are parts of a larger picture."""
+        return tuple(part.camera for part in self.parts)
 
     @property
     def truth_size(self) -> int:
@@ -116,9 +121,14 @@ class Spec:
         if camera in self.cut and (shape[0], shape[1]) != tuple(self.image_size):
             height, width = self.image_size
             raise UserError(
-                f"{what} has {shape[1]} by {shape[0]} pixels, but {camera} shows a part of a larger picture: cut that "
-                f"out as the world of the policy does, {width} by {height} pixels"
+                f"{what} has {shape[1]} by {shape[0]} pixels, but {camera} shows a part of a larger picture: give that "
+                f'as "{PICTURE}", or the part in {width} by {height} pixels'
             )
+
+    def images(self, observation: Observation) -> Mapping[str, Array]:
+        """Return camera → image, of which parts that are missing are cut out of the whole picture if it is there."""
+        state = dict(zip(self.state, observation.state, strict=False))
+        return with_parts(observation.rgb, state, self.parts, self.image_size)
 
     def random_observation(self, random: np.random.Generator) -> Observation:
         """Return an observation of noise, with a fixed instruction and no truth."""
@@ -143,11 +153,11 @@ class Spec:
     def require(self, other: Spec, what: str, against: str) -> None:
         """Raise a UserError naming the first field in which the spec of `what` (self) differs from `against`.
 
-        What is unknown to one of them, chain, home or cut cameras, is no difference.
+        What is unknown to one of them, chain, home or parts, is no difference.
         """
         mine, theirs = _fields(self), _fields(other)
         for name, value in mine.items():
-            unknown = name in ("robot.chain", "robot.home", "cut") and () in (value, theirs.get(name))
+            unknown = name in ("robot.chain", "robot.home", "parts") and () in (value, theirs.get(name))
             if value != theirs.get(name) and not unknown:
                 raise UserError(
                     f"{what} has {name} = {str(value)[:200]}, but {against} has {str(theirs.get(name))[:200]}"
@@ -156,7 +166,7 @@ class Spec:
     def require_input(self, other: Spec, what: str, against: str) -> None:
         """Do as `require` for what a policy sees and does: images that are not cut may have another size."""
         mine, theirs = self.without_truth, other.without_truth
-        (mine if self.cut else replace(mine, image_size=theirs.image_size)).require(theirs, what, against)
+        (mine if self.parts else replace(mine, image_size=theirs.image_size)).require(theirs, what, against)
 
 
 def _fields(spec: Spec) -> dict[str, Any]:
@@ -173,9 +183,12 @@ def _contradictions(spec: Spec) -> Iterator[str]:
     for name, low, high in zip(spec.action, spec.low, spec.high, strict=False):
         if not low < high:
             yield f"low of {name} is {low}, not less than high, {high}"
-    for name in ("depth", "cut"):
-        if unknown := [camera for camera in getattr(spec, name) if camera not in spec.cameras]:
-            yield f"{name} names {', '.join(unknown)}, which is not among the cameras"
+    if unknown := [camera for camera in spec.depth if camera not in spec.cameras]:
+        yield f"depth names {', '.join(unknown)}, which is not among the cameras"
+    if not unique(spec.cut):
+        yield "parts names a camera twice"
+    for part in spec.parts:
+        yield from part.problems(spec.cameras, spec.state)
     if not unique([name for name, _ in spec.truth]) or spec.truth_size > 4096:
         yield "truth has a name twice, or more than 4096 numbers"
     if robot := spec.robot:

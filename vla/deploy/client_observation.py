@@ -10,6 +10,7 @@ import numpy as np
 from annotated_types import MinLen
 
 from vla.io.errors import UserError
+from vla.io.parts import PICTURE
 from vla.io.types import Text
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Running, Spec
 
@@ -20,20 +21,27 @@ LARGEST_IMAGE = 4096  # pixels in a row or column
 class Keys:
     """Keys of a client's observation; a key that is absent is also looked up as a path of nested maps."""
 
-    images: dict[str, Text]  # camera → image
+    images: dict[str, Text]  # camera → image; "picture" is the whole one of which cameras show parts
     state: Annotated[list[Text], MinLen(1)]  # vectors to concatenate
     prompt: Text  # instruction
+
+    def cameras(self, spec: Spec) -> list[str]:
+        """Return what a client sends: all cameras, or the whole picture in place of those that show parts of it."""
+        if not spec.parts or PICTURE not in self.images:
+            return [*spec.cameras]
+        return [PICTURE, *(camera for camera in spec.cameras if camera not in spec.cut)]
 
     def observation(self, message: Any, spec: Spec) -> Observation:
         """Convert a client's observation, whose images may have any size; a UserError if it does not match the spec."""
         if not isinstance(message, Mapping):
             raise UserError(f"an observation is a map, not {type(message).__name__}")
-        wanted = [*(self.images[camera] for camera in spec.cameras), *self.state, self.prompt]
+        cameras = self.cameras(spec)
+        wanted = [*(self.images[camera] for camera in cameras), *self.state, self.prompt]
         found = {key: _find(message, key) for key in wanted}
         if missing := [key for key, value in found.items() if value is None]:
             present = ", ".join(str(key)[:50] for key in list(message)[:20])
             raise UserError(f"the observation lacks {', '.join(missing)}: it has {present or 'nothing'}")
-        images = {camera: _image(self.images[camera], found[self.images[camera]]) for camera in spec.cameras}
+        images = {camera: _image(self.images[camera], found[self.images[camera]]) for camera in cameras}
         for camera, image in images.items():
             spec.require_cut(camera, image.shape, self.images[camera])
         state = np.concatenate([_vector(key, found[key]) for key in self.state])

@@ -16,9 +16,11 @@ from gymnasium.spaces import Box, Dict
 
 from vla.envs.gym import Task
 from vla.io.errors import UserError
+from vla.io.parts import PICTURE
 from vla.spec import FIRST_SEED, Array, Observation, Spec
 
-IMAGES, STATE, RATES = "observation.images.", "observation.state", "observation.velocities"
+IMAGES, WHOLE = "observation.images.", "observation.image"  # of cameras, and of an environment with one
+STATE, RATES = "observation.state", "observation.velocities"
 TASK = "task"  # the instructions
 AGENT = {STATE: "agent_pos", RATES: "velocities"}  # what an environment calls them, before LeRobot renames them
 
@@ -76,15 +78,18 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
     """Convert a batch of LeRobot's to observations.
 
     Args:
-        batch: `observation.images.CAMERA` (B, 3, H, W) from 0 to 1, `observation.state` and `observation.velocities`
-            (B, …) arrays, and `task`, B instructions.
+        batch: `observation.images.CAMERA` (B, 3, H, W) from 0 to 1, or `observation.image`, of which cameras show
+            parts; `observation.state` and `observation.velocities` (B, …) arrays, and `task`, B instructions.
         spec: of the policy.
 
     Raises:
         UserError: an entry is missing or has another shape.
     """
     parts = _parts(spec)
-    needed = [*(f"{IMAGES}{camera}" for camera in spec.cameras), *parts, TASK]
+    keys = {camera: f"{IMAGES}{camera}" for camera in spec.cameras}
+    if spec.parts and WHOLE in batch:
+        keys = {PICTURE: WHOLE, **{camera: key for camera, key in keys.items() if camera not in spec.cut}}
+    needed = [*keys.values(), *parts, TASK]
     if missing := [key for key in needed if key not in batch]:
         raise UserError(f"the policy needs {', '.join(missing)}; there are {', '.join(map(str, batch))}")
     count = len(batch[STATE])
@@ -94,7 +99,7 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
             names = ", ".join(spec.state[index] for index in indices)
             raise UserError(f"{key} must be ({count}, {len(indices)}): {names}; it is {batch[key].shape}")
         state[:, indices] = batch[key]
-    images = {camera: _pixels(batch[f"{IMAGES}{camera}"]) for camera in spec.cameras}
+    images = {camera: _pixels(batch[key]) for camera, key in keys.items()}
     instructions: Sequence[str] = batch[TASK]
     return [
         Observation({camera: image[row] for camera, image in images.items()}, state[row], instructions[row])

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import ACTION
 
-from vla.envs.lerobot import IMAGES, RATES, STATE
+from vla.envs.lerobot import IMAGES, RATES, STATE, WHOLE
 from vla.models.policy_folder import read_policy
 
 
@@ -23,12 +23,14 @@ class VlaConfig(PreTrainedConfig):
         precision: "fp32" or "bf16".
         compile: compile the model.
         lanes: environments that one pass through the model serves; unused ones are padding.
+        scale: factor of each component of an action, for environments with other units; none: as in training.
     """
 
     checkpoint: str = ""
     precision: str = "fp32"
     compile: bool = False
     lanes: int = 1
+    scale: list[float] = field(default_factory=list)
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:
@@ -44,11 +46,14 @@ class VlaConfig(PreTrainedConfig):
         """
         spec = read_policy(checkpoint).spec
         vectors = {STATE: len(spec.pose), **({RATES: len(spec.rates)} if spec.rates else {})}
+        images = [*(f"{IMAGES}{name}" for name in spec.cameras), *([WHOLE] if spec.parts else [])]
         self.input_features = {
-            **{f"{IMAGES}{name}": PolicyFeature(FeatureType.VISUAL, (3, *spec.image_size)) for name in spec.cameras},
+            **{key: PolicyFeature(FeatureType.VISUAL, (3, *spec.image_size)) for key in images},
             **{key: PolicyFeature(FeatureType.STATE, (size,)) for key, size in vectors.items()},
         }
         self.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(spec.action),))}
+        if self.scale and len(self.scale) != len(spec.action):
+            raise ValueError(f"--policy.scale has {len(self.scale)} factors, an action {', '.join(spec.action)}")
 
     @property
     def observation_delta_indices(self) -> None:

@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -97,4 +98,5 @@ class VlaPolicy(PreTrainedPolicy):
             for lane in lanes:
                 self._policy.reset(seen[lane].instruction, lane, lane)
         answers: Array = question(seen, lanes)
+        answers *= np.array(self.config.scale or 1, np.float32)
         return torch.from_numpy(answers).to(self._policy.device)

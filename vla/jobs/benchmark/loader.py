@@ -46,7 +46,7 @@ def _of_large_images(experiment: Experiment, chunk: int) -> dict[str, Measure]:
     seeds = range(experiment.options(Benchmark).episodes)
     episodes = [_from_three_cameras(rollout(environment, expert, seed)) for seed in seeds]
     environment.close()
-    spec = replace(environment.spec, cameras=tuple(episodes[0].observations[0].rgb), depth=(), cut=())
+    spec = replace(environment.spec, cameras=tuple(episodes[0].observations[0].rgb), depth=(), parts=())
     every = experiment.with_values({"collect.episodes": len(seeds), "data.validation_fraction": 0})
     for codec in (Codec.suited(spec), Codec("jpeg", experiment.collect.quality)):
         with TemporaryDirectory() as folder:

@@ -14,7 +14,7 @@ from vla.io.types import ImageSize, Names, Natural, Share, Text
 from vla.parallel.limits import free_memory
 from vla.spec import Array, Observation, Spec
 from vla.tasks.metaworld.package import tasks_of
-from vla.tasks.metaworld.scene import CAMERA, HAND, PictureSettings, TaskScene
+from vla.tasks.metaworld.scene import PictureSettings, TaskScene, parts_of
 from vla.tasks.rendering.renderer import RendererFactory
 from vla.tasks.world import World
 
@@ -98,11 +98,11 @@ class MetaWorld(World):
             high=(REACH, REACH, REACH, 1.0),
             control_hz=CONTROL_HZ,
             truth=(("object", 3), ("goal", 3)),
-            cut=tuple(name for name in cameras if name == HAND or (name == CAMERA and window is not None)),
+            parts=tuple(parts_of(cameras, window, hand_size)),
         )
         self._sentences, self._steps = sentences, steps
         size = self.spec.image_size
-        settings = PictureSettings(renderer, self.spec.cameras, size, window, hand_size, drawn, shadows)
+        settings = PictureSettings(renderer, self.spec.cameras, size, self.spec.parts, drawn, shadows)
         self._make_scene = partial(TaskScene, settings=settings)
         self._scenes: dict[str, TaskScene] = {}
         self.tool: Array = np.zeros(3)

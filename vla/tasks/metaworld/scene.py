@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from PIL import Image
 
 from vla.io.errors import UserError
+from vla.io.parts import Part, cut
 from vla.spec import Array
 from vla.tasks.metaworld.package import simulator, stop_sliding
-from vla.tasks.rendering.renderer import WHOLE, Renderer, RendererFactory, Views
+from vla.tasks.rendering.renderer import Renderer, RendererFactory, Views
 
 HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the optical axis, quaternion wxyz
 # LeRobot (src/lerobot/envs/metaworld.py) moves this camera, which hangs upside down, and turns its pictures.
@@ -20,6 +20,9 @@ CAMERA, CAMERA_PLACE = "corner2", (0.75, 0.075, 0.7)  # [m]
 LEROBOT = 480  # height and width of its pictures [px]
 HAND = "hand"  # the part of CAMERA's picture around the fingertips, in place of a camera
 MIDDLE = (0.0, 0.0, -0.075)  # of that part, 3 cm below the fingertips, from the position of the hand [m]
+PLACE = ("hand_x", "hand_y", "hand_z")  # of the hand, in the state
+FOVY = 60.0  # of CAMERA [degrees], and its orientation in every task before the turn, wxyz
+ORIENTATION = (-0.39503823089303436, 0.26266733956017996, -0.4349370357280407, 0.7653629464596412)
 CURRENT, BEFORE = slice(18), slice(18, 36)  # of an observation (39,): hand, gripper, objects now and one step before
 
 
@@ -30,9 +33,8 @@ class PictureSettings:
     renderer: RendererFactory
     cameras: tuple[str, ...]  # names in the model, or HAND
     image_size: tuple[int, int]  # height and width of the pictures [px]
-    window: Sequence[float] | None  # this and what follows: see `MetaWorld`
-    hand_size: float
-    drawn: int | None
+    parts: tuple[Part, ...]  # what cameras show of LeRobot's picture
+    drawn: int | None  # this and what follows: see `MetaWorld`
     shadows: int
 
 
@@ -42,7 +44,7 @@ class TaskScene:
     def __init__(self, task: str, settings: PictureSettings) -> None:
         """Compile a task; a UserError if it lacks a camera."""
         self._settings, self.simulator = settings, simulator(task)
-        model, cameras, window = self.simulator.model, settings.cameras, settings.window
+        model, cameras = self.simulator.model, settings.cameras
         self.model = model
         known = [model.camera(number).name for number in range(model.ncam)]
         if unknown := [name for name in cameras if name not in (*known, HAND)]:
@@ -52,13 +54,11 @@ class TaskScene:
             )
         camera = self._camera = known.index(CAMERA)
         model.cam_pos[camera] = CAMERA_PLACE
-        turned = np.empty(4)
-        mujoco.mju_mulQuat(turned, model.cam_quat[camera].copy(), HALF_TURN)
-        model.cam_quat[camera] = turned
+        model.cam_quat[camera] = _turned()
         model.vis.quality.shadowsize = settings.shadows
         model.mat_reflectance[:] = 0  # of the renderers none draws it, and in no task does it show from corner2
-        self._windows = np.array([window if window and name == CAMERA else WHOLE for name in cameras], float)
-        self._hands = [number for number, name in enumerate(cameras) if name == HAND]
+        shown = {part.camera: part for part in settings.parts}
+        self._parts = [shown.get(name, Part(name)) for name in cameras]
         self._places = [known.index(CAMERA if name == HAND else name) for name in cameras]
         # All of a camera's picture is drawn once.
         seen = self._places if settings.drawn is None else sorted(set(self._places))
@@ -96,24 +96,13 @@ class TaskScene:
         elif self._changed:
             self._renderer.update()
         self._changed = False
-        for number in self._hands:
-            self._windows[number] = self._around_the_hand()
+        hand = self.simulator.get_endeff_pos()
+        windows = np.array([part.at(hand) for part in self._parts])
         if self._settings.drawn is None:
-            return self._renderer.render(self.simulator.data, self._windows)[0]
+            return self._renderer.render(self.simulator.data, windows)[0]
         pictures = dict(zip(self._views.cameras, self._renderer.render(self.simulator.data)[0], strict=True))
-        shown = zip(self._places, self._windows, strict=True)
-        return np.stack([_cut(pictures[camera], window, self._settings.image_size) for camera, window in shown])
-
-    def _around_the_hand(self) -> Array:
-        """Return the window (4,) of CAMERA's picture around the fingertips, of whole pixels of LeRobot's picture."""
-        data, fovy = self.simulator.data, self.model.cam_fovy[self._camera]
-        there = self.simulator.get_endeff_pos() + MIDDLE - data.cam_xpos[self._camera]
-        across, up, behind = data.cam_xmat[self._camera].reshape(3, 3).T @ there
-        half = -behind * np.tan(np.radians(fovy / 2))  # of the whole picture, at that distance
-        size = self._settings.hand_size
-        corner = np.array([(1 - up / half) / 2, (1 + across / half) / 2]) - size / 2
-        upper, left = (np.rint(LEROBOT * corner) / LEROBOT).clip(0, 1 - size)
-        return np.array([upper, left, upper + size, left + size])
+        shown = zip(self._places, windows, strict=True)
+        return np.stack([cut(pictures[camera], window, self._settings.image_size) for camera, window in shown])
 
     def close(self) -> None:
         """Free physics and GL."""
@@ -123,8 +112,28 @@ class TaskScene:
         self.simulator.close()
 
 
-def _cut(picture: Array, window: Sequence[float], size: tuple[int, int]) -> Array:
-    """Return a window of a square picture (drawn, drawn, 3), averaged to a size: height and width [px]."""
-    top, left, bottom, right = (len(picture) * share for share in window)
-    image = Image.fromarray(picture).resize(size[::-1], Image.Resampling.BOX, (left, top, right, bottom))
-    return np.asarray(image)
+def parts_of(cameras: Sequence[str], window: Sequence[float] | None, hand_size: float) -> Iterator[Part]:
+    """Yield what cameras show of LeRobot's picture: CAMERA a window of it, if any, HAND the part around the hand."""
+    if window is not None and CAMERA in cameras:
+        yield Part(CAMERA, tuple(window))
+    if HAND in cameras:
+        half = hand_size / 2
+        yield Part(HAND, (-half, -half, half, half), PLACE, MIDDLE, _projection(), LEROBOT)
+
+
+def _turned() -> Array:
+    """Return the orientation (4,) of CAMERA as LeRobot turns its pictures, wxyz."""
+    turned = np.empty(4)
+    mujoco.mju_mulQuat(turned, np.array(ORIENTATION), HALF_TURN)
+    return turned
+
+
+def _projection() -> tuple[float, ...]:
+    """Return the (3, 4) matrix of `Part.projection` for LeRobot's picture, row by row."""
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, _turned())
+    across, up, behind = axes.reshape(3, 3).T
+    scale = 2 * np.tan(np.radians(FOVY / 2))  # height of the picture at a depth of 1
+    rows = np.stack([-behind * scale / 2 - up, -behind * scale / 2 + across, -behind * scale])
+    moved = np.column_stack([rows, -rows @ np.array(CAMERA_PLACE)])
+    return tuple(moved.ravel().tolist())

@@ -1,0 +1,95 @@
+"""Images that are parts of a larger picture, as anybody cuts them out who has the picture and the state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Ge, Le, MaxLen, MinLen, Predicate
+from PIL import Image
+
+from vla.io.documents import STRICT
+from vla.io.types import names_a_file
+
+Array = np.ndarray
+
+PICTURE = "picture"  # in place of a camera: the whole picture
+WHOLE = (0.0, 0.0, 1.0, 1.0)
+
+Name = Annotated[str, MinLen(1), MaxLen(100)]
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of a picture that a camera shows: a fixed one, or one around a point of the robot.
+
+    A window is top, left, bottom and right, as shares of the picture's height and width.
+    """
+
+    __pydantic_config__ = STRICT
+
+    camera: Annotated[Name, Predicate(names_a_file)]
+    window: Annotated[tuple[float, ...], MinLen(4), MaxLen(4)] = WHOLE  # of a part that moves: where its middle is 0, 0
+    point: Annotated[tuple[Name, ...], MaxLen(3)] = ()  # (3,) state components, a place [m]; none: it does not move
+    offset: Annotated[tuple[float, ...], MaxLen(3)] = ()  # (3,) from that place to the middle of the part [m]
+    # (12,) row by row: the place of the middle (x, y, z, 1) → (down, across, 1), as shares of the picture, times depth.
+    projection: Annotated[tuple[float, ...], MaxLen(12)] = ()
+    pixels: Annotated[int, Ge(1), Le(4096)] = 1  # a part that moves does so by this fraction of the picture
+
+    def at(self, place: Array) -> Array:
+        """Return the window (4,), within the picture, with the point at `place` (3,) [m]."""
+        window = np.array(self.window)
+        if not self.point:
+            return window
+        down, across, depth = np.reshape(self.projection, (3, 4)) @ (*(place + self.offset), 1.0)
+        corner = np.array([down, across]) / max(depth, 1e-6) + window[:2]
+        size = window[2:] - window[:2]
+        corner = (np.rint(self.pixels * corner) / self.pixels).clip(0, 1 - size)
+        return np.concatenate([corner, corner + size])
+
+    def problems(self, cameras: Sequence[str], state: Sequence[str]) -> Iterator[str]:
+        """Yield what contradicts itself, or the cameras and the state of a spec."""
+        top, left, bottom, right = self.window
+        if self.camera not in cameras:
+            yield f"parts names {self.camera}, which is not among the cameras"
+        if not (0 < bottom - top <= 1 and 0 < right - left <= 1) or (not self.point and min(top, left) < 0):
+            yield f"the window of {self.camera} is {self.window}, not top, left, bottom and right within the picture"
+        if not self.point and max(bottom, right) > 1:
+            yield f"the window of {self.camera} ends outside the picture"
+        if unknown := [name for name in self.point if name not in state]:
+            yield f"the part of {self.camera} moves with {', '.join(unknown)}, which is not in the state"
+        if (len(self.point), len(self.offset), len(self.projection)) not in ((0, 0, 0), (3, 3, 12)):
+            yield f"the part of {self.camera} needs three names in point, and 3 and 12 numbers, or none of them"
+
+
+def cut(picture: Array, window: Sequence[float] | Array, size: tuple[int, int]) -> Array:
+    """Return a window of a picture (H, W, 3) uint8, averaged over areas to a size: height and width [px]."""
+    height, width = picture.shape[:2]
+    top, left, bottom, right = np.array(window) * (height, width, height, width)
+    image = Image.fromarray(picture).resize(size[::-1], Image.Resampling.BOX, (left, top, right, bottom))
+    return np.asarray(image)
+
+
+def with_parts(
+    images: Mapping[str, Array], state: Mapping[str, float], parts: Sequence[Part], size: tuple[int, int]
+) -> Mapping[str, Array]:
+    """Add the images (size, 3) of the parts that are missing, cut out of the whole picture if there is one.
+
+    Args:
+        images: camera, or `PICTURE`, → (H, W, 3) uint8.
+        state: component → its value.
+        parts: where they are.
+        size: height and width [px] of what is cut out.
+    """
+    if PICTURE not in images:
+        return images
+    missing = [part for part in parts if part.camera not in images]
+    places = [np.array([state[name] for name in part.point], np.float64) for part in missing]
+    return {
+        **images,
+        **{
+            part.camera: cut(images[PICTURE], part.at(place), size) for part, place in zip(missing, places, strict=True)
+        },
+    }
