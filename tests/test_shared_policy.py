@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from multiprocessing.shared_memory import SharedMemory
 from typing import Any
@@ -52,6 +53,17 @@ def test_an_episode_is_that_of_the_policy_alone_and_so_are_chunks_and_probabilit
         np.testing.assert_array_equal(agent.plan(seen), planned)
 
 
+def test_a_world_with_sharper_cameras_has_its_images_resized_by_the_policy() -> None:
+    policy = as_policy(make_bc())
+    sharp = replace(SPEC, image_size=(20, 32))
+    seen = sharp.random_observation(np.random.default_rng(0))
+    policy.reset(seen.instruction, 0)
+    expected = policy.act([seen], [0])
+    with shared_policy(lambda: policy) as make_agent, closing(make_agent(ToyEnvironment(spec=sharp))) as agent:
+        agent.reset(seen.instruction, 0)
+        np.testing.assert_array_equal(agent.act(seen), expected[0])
+
+
 def test_what_does_not_fit_is_said_and_no_memory_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     used: list[str] = []
 
@@ -67,7 +79,7 @@ def test_what_does_not_fit_is_said_and_no_memory_is_left_behind(monkeypatch: pyt
         with closing(make_agent(ToyEnvironment())) as agent:
             (seen,) = (SPEC.random_observation(np.random.default_rng(0)),)
             with pytest.raises(
-                ValueError, match=r"the policy needs eye of \(16, 16, 3\) uint8, not \(8, 16, 3\) uint8"
+                ValueError, match=r"the world gives eye of \(16, 16, 3\) uint8, not \(8, 16, 3\) uint8"
             ):
                 agent.act(Observation({"eye": seen.rgb["eye"][:8]}, seen.state, "go"))
             with pytest.raises(ValueError, match=r"the policy needs cameras"):

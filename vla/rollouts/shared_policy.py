@@ -55,17 +55,17 @@ def shared_policy(make_policy: Callable[[], _Planner]) -> Iterator[Callable[[Env
             finally:
                 requests.put(None)
                 with suppress(OSError), Client(listener.address, authkey=key) as last:
-                    last.send(False)  # ends `_accept`, which would not notice that its socket is closed
+                    last.send(None)  # ends `_accept`, which would not notice that its socket is closed
 
 
-def _accept(listener: Listener, begin: Callable[[int, Connection], object]) -> None:
+def _accept(listener: Listener, begin: Callable[[int, Connection, Spec], object]) -> None:
     """Begin a talk with every worker that connects, each in a lane of its own."""
     for lane in count():
         with suppress(AuthenticationError, EOFError, OSError):  # whoever else finds the socket
             connection = listener.accept()
-            if not connection.recv():
+            if (spec := connection.recv()) is None:
                 return
-            begin(lane, connection)
+            begin(lane, connection, spec)
 
 
 def _serve(policy: _Planner, requests: queue.Queue[Request | None]) -> None:
@@ -100,12 +100,14 @@ def _answer(call: Callable[..., Iterable[Any]], requests: Sequence[Request]) -> 
             request[3].set_result(answer)
 
 
-def _talk(policy: _Planner, requests: queue.Queue[Request | None], lane: int, connection: Connection) -> None:
-    """Ask the policy what a worker asks, until it leaves."""
-    spec, memory = policy.spec, SharedMemory(create=True, size=sum(_sizes(policy.spec)))
+def _talk(
+    policy: _Planner, requests: queue.Queue[Request | None], lane: int, connection: Connection, spec: Spec
+) -> None:
+    """Ask the policy what a worker asks, whose world has this spec, until it leaves."""
+    memory = SharedMemory(create=True, size=sum(_sizes(spec)))
     try:
         with connection, suppress(EOFError, OSError):  # it has left, or was killed
-            connection.send((memory.name, spec, policy.execute, policy.history))
+            connection.send((memory.name, policy.spec, policy.execute, policy.history))
             while True:
                 kind, instruction, given = connection.recv()
                 asked = (instruction, given) if kind == "reset" else _observation(memory, spec, instruction, given)
@@ -145,13 +147,13 @@ class _DistantPolicy:
 
     def __init__(self, address: str, key: bytes, spec: Spec) -> None:
         """Connect to a policy; a UserError if it has another spec than the environment."""
-        self._connection = Client(address, authkey=key)
-        self._connection.send(True)
+        self._connection, self._world = Client(address, authkey=key), spec.without_truth
+        self._connection.send(self._world)
         name, self.spec, self.execute, self.history = self._connection.recv()
         self.info: dict[str, Any] = {}
         self.looks = True
         try:
-            self.spec.without_truth.require(spec.without_truth, "the policy", "the task")
+            self.spec.require_input(spec, "the policy", "the task")
         except ValueError:
             self._connection.close()
             raise
@@ -171,13 +173,13 @@ class _DistantPolicy:
 
     def _asked(self, kind: str, observation: Observation) -> Array:
         given: Mapping[str, Array] = {**observation.rgb, "": np.asarray(observation.state, np.float32)}
-        for name, place in _views(self._memory, self.spec).items():
+        for name, place in _views(self._memory, self._world).items():
             array = given.get(name, place)
             if (array.shape, array.dtype) != (place.shape, place.dtype):
                 wanted, found = (f"{each.shape} {each.dtype}" for each in (place, array))
-                raise UserError(f"the policy needs {name or 'a state'} of {wanted}, not {found}")
+                raise UserError(f"the world gives {name or 'a state'} of {wanted}, not {found}")
             place[:] = array
-        images = all(camera in given for camera in self.spec.cameras)
+        images = all(camera in given for camera in self._world.cameras)
         return self._ask(kind, observation.instruction, (images, observation.running))
 
     def _ask(self, kind: str, instruction: str, given: object) -> Any:

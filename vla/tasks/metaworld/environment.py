@@ -67,7 +67,7 @@ class MetaWorld(World):
             renderer: renderer of the images.
             image_size: height and width of every camera's images [px].
             cameras: names of cameras, such as "corner2", which is moved and turned as LeRobot does, or "hand", the part
-                of "corner2" around the fingertips.
+                of "corner2" around a point 75 mm below the hand, in whole pixels of LeRobot's picture.
             window: top, left, bottom and right of LeRobot's picture that "corner2" shows, as shares of its height and
                 width; None: all of it.
             hand_size: height and width of what "hand" shows, as shares of LeRobot's picture.
