@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tiny_pi
+import tiny_vla
 import torch
 from composing import check, composed
 from defaults import defaults_of
 from fake_batch import as_policy, make_act, make_batch, make_denoising, with_text
 from observing import observations
+from tiny_pi import make_policy
+from tiny_vla import make_smolvla
 from torch import Tensor
 from toy import SPEC, ToyEnvironment, make_environment
 
@@ -22,11 +27,12 @@ from vla.config.experiment import Experiment
 from vla.jobs.evaluate import require_possible
 from vla.models.chunking import Chunking, Guided, Running, TrainedPrefix, require_fit
 from vla.models.flow import Flow
+from vla.models.vlm.policy import VisionLanguageAction
 from vla.rollouts.realtime import Network, OverNetwork, make_over_network
 from vla.rollouts.rollout import AgentFactory, rollout
 from vla.rollouts.shared_policy import shared_policy
 from vla.schedule import Delays, Schedule
-from vla.spec import FIRST_SEED, Array, Observation
+from vla.spec import FIRST_SEED, Array, Observation, Spec
 from vla.spec import Running as RunningPlan
 
 METHODS: dict[str, Callable[[], Chunking]] = {
@@ -300,3 +306,53 @@ def test_before_any_work_plans_must_be_long_enough_for_the_network(tmp_path: Pat
         ValueError, match=r"late by 3 actions ends before the next one, which follows 3 actions after it"
     ):
         require_possible(Experiment.of(composed(*config, "model.chunk=5")))
+
+
+VLAS: dict[str, tuple[Callable[..., VisionLanguageAction], Spec]] = {
+    "smolvla": (make_smolvla, tiny_vla.SPEC),
+    "pi0": (partial(make_policy, "pi0"), tiny_pi.SPEC),
+    "pi05": (partial(make_policy, "pi05"), tiny_pi.SPEC),
+}
+
+
+def make_vla(name: str, **options: Any) -> tuple[VisionLanguageAction, Spec]:
+    """A tiny vision-language-action model that plans six actions, of which two are executed, and its spec."""
+    make, spec = VLAS[name]
+    model = make(execute=2, prefix=3, normalization="mean_std", **options)
+    random = np.random.default_rng(0)
+    model.fit(*(random.standard_normal((50, len(part))) for part in (spec.state, spec.action)))
+    return model, spec
+
+
+@every_method
+@pytest.mark.parametrize("name", VLAS)
+def test_plans_of_vision_language_action_models_continue_each_other(name: str, method: Callable[[], Chunking]) -> None:
+    model, spec = make_vla(name)
+    policy, free = as_policy(model, spec, chunking=method()), as_policy(model, spec)
+    first, second = (spec.random_observation(np.random.default_rng(seed)) for seed in (0, 1))
+    plan = policy.plan(first)
+    np.testing.assert_allclose(free.plan(first), plan, atol=1e-4)
+    going = replace(second, running=RunningPlan(plan[1:], 2))
+    following, unaware = policy.plan(going), free.plan(going)
+    np.testing.assert_array_equal(following[:2], plan[1:3])
+    assert not np.allclose(unaware[2:], following[2:], atol=1e-4)
+
+
+@pytest.mark.parametrize("name", VLAS)
+def test_what_follows_the_prefix_is_learned_by_vision_language_action_models(name: str) -> None:
+    model, spec = make_vla(name)
+    batch = with_text(model, make_batch(1, model.chunk, spec=spec, size=2))
+    batch |= {"noise": torch.randn(2, *model.noise.shape), "time": torch.tensor([0.3, 0.6])}
+    batch["length"] = torch.tensor([3, 0])
+
+    def error(**changes: Tensor) -> float:
+        given = {**batch, **changes}
+        return float(model.action_loss(model(given), given)["action_loss"].detach())
+
+    expected, known = error(), torch.zeros_like(batch["action"], dtype=torch.bool)
+    known[0, :, :3] = True
+    changed = batch["action"] + 0.1
+    assert error(action=torch.where(known, changed, batch["action"])) == expected
+    assert error(executed=torch.where(known, batch["executed"], changed)) == expected
+    assert error(executed=torch.where(known, changed, batch["executed"])) != expected
+    assert error(action=torch.where(known, batch["action"], changed)) != expected

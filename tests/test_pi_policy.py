@@ -30,7 +30,7 @@ def test_the_way_from_observations_to_commands_is_that_of_lerobot(tmp_path: Path
     assert torch.equal(tokens != PADDING, sentence) and torch.equal(tokens[sentence], theirs["way.tokens"][sentence])
     assert sentence[0].all() and not sentence[1].all()  # one prompt is cut, the other is not
     assert deviation(state, theirs["way.state"]) < TOLERANCE
-    assert deviation(model.padded(given["actions"]), theirs["way.actions"]) < TOLERANCE
+    assert deviation(model.scaled(given["actions"]), theirs["way.actions"]) < TOLERANCE
     assert deviation(model.image(given["images"][0]), theirs["way.image"]) < TOLERANCE
     assert theirs["way.present"].tolist() == [[True, True, False]] * 2  # a third camera is missing there
     with torch.no_grad():

@@ -68,7 +68,7 @@ def test_the_way_from_an_observation_to_executed_actions_is_that_of_lerobot(toke
     assert deviation(state, theirs["way.state"][0, : len(state)]) <= TOLERANCE
     assert not theirs["way.state"][0, len(state) :].any()
     assert (
-        deviation(model.padded(torch.from_numpy(steps(len(SPEC.action))[:CHUNK])), theirs["way.actions"]) <= TOLERANCE
+        deviation(model.scaled(torch.from_numpy(steps(len(SPEC.action))[:CHUNK])), theirs["way.actions"]) <= TOLERANCE
     )
     assert torch.equal(model.text.tokenize([*SENTENCES]), theirs["way.tokens"])
     model.sample_noise = lambda random: theirs["policy.noise"]  # type: ignore[method-assign]

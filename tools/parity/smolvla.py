@@ -183,7 +183,7 @@ def compare_inputs(theirs: SmolVLAPolicy, before: Any, model: Any) -> dict[str, 
     compare(
         "state", torch.nn.functional.pad(state, (0, SMOLVLA["state_width"] - len(SPEC.state))), results["way.state"]
     )
-    compare("actions", model.padded(known), results["way.actions"])
+    compare("actions", model.scaled(known), results["way.actions"])
     assert torch.equal(model.text.tokenize([*SENTENCES]), results["way.tokens"])
     return results
 

@@ -90,12 +90,23 @@ def with_prefix(noisy: Tensor, time: Tensor, clean: Tensor, length: Tensor) -> t
 def require_chunking(method: type, model: type, prefix: int) -> None:
     """Raise a UserError unless models of a class, trained with prefixes up to a length, can continue plans."""
     if not getattr(model, "continues", False):
-        why = f"continues the plans of flow models, and {model.__name__} is none: omit it, or choose model=flow"
+        why = (
+            f"continues the plans of flow models, and {model.__name__} is none: omit it, or choose model=flow or a VLA"
+        )
     elif issubclass(method, TrainedPrefix) and not prefix:
         why = "needs a model that was trained with prefixes: model.prefix=4; else choose +policy/chunking=guided"
     else:
         return
     raise UserError(f"policy.chunking={method.__name__} {why}")
+
+
+def require_prefix(prefix: int, execute: int, chunk: int) -> None:
+    """Raise a UserError if actions that training gives leave fewer of a chunk than are executed."""
+    if prefix and prefix + execute > chunk:
+        left = f"less than {execute} of the model.chunk={chunk} actions"
+        raise UserError(
+            f"model.prefix={prefix} leaves {left}, which are executed: lower it or model.execute, or raise model.chunk"
+        )
 
 
 def require_fit(method: type, model: Mapping[str, Any], delay: int) -> None:

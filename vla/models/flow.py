@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from vla.io.errors import UserError
 from vla.io.types import Inherited, Natural
+from vla.models.chunking import require_prefix
 from vla.models.denoiser import Denoise, DenoisingModel
 
 MAX_TIME = 0.999  # of training
@@ -37,9 +37,7 @@ class Flow(DenoisingModel):
     def __init__(self, prefix: Natural, **inherited: Inherited) -> None:
         super().__init__(**inherited)
         self.prefix = prefix
-        if prefix + self.execute > self.chunk:
-            left = f"less than {self.execute} of the model.chunk={self.chunk} actions"
-            raise UserError(f"model.prefix={prefix} leaves {left}, which are executed: lower it, or raise model.chunk")
+        require_prefix(prefix, self.execute, self.chunk)
 
     def corrupt(self, action: Tensor, noise: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Interpolate between noise and actions; the target is the constant velocity of that path."""

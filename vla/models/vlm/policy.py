@@ -18,7 +18,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from vla.io.errors import UserError
-from vla.io.types import Shift, Steps, Text
+from vla.io.types import Natural, Shift, Steps, Text
+from vla.models.chunking import require_prefix, with_prefix
 from vla.models.layers import Batch, mean_where
 from vla.models.model import Model, Prediction
 from vla.models.tokenizers.tokenizer import ActionTokenizer
@@ -49,6 +50,7 @@ class VisionLanguageAction(Model):
             cameras of the demonstrations in their order.
         chunk: k.
         execute: number of the k actions that a policy executes before it predicts again; null: all.
+        prefix: see `vla.models.flow.Flow`.
         steps: Euler steps from noise to actions.
         copies: R, number of noisy copies of each chunk in a training batch, which share its prefix.
         normalization: of state and actions.
@@ -57,10 +59,12 @@ class VisionLanguageAction(Model):
         shift: largest random shift of the training images, vertical and horizontal [1/256 of the image height].
 
     Raises:
-        UserError: state or actions have too many components, a camera is unknown, or the trunk does not fit.
+        UserError: state or actions have too many components, a camera is unknown, the trunk does not fit, or `prefix`
+            leaves fewer actions than are executed.
     """
 
     uses_tokens = False
+    continues = True
 
     noise: Tensor
 
@@ -72,6 +76,7 @@ class VisionLanguageAction(Model):
         cameras: dict[str, str | None] | None,
         chunk: Steps,
         execute: Steps | None,
+        prefix: Natural,
         steps: Steps,
         copies: Steps,
         normalization: Kind,
@@ -84,7 +89,8 @@ class VisionLanguageAction(Model):
     ) -> None:
         widths = {"text_width": 1, "width": 1, "auxiliary": 0.0}
         super().__init__(text, chunk=chunk, execute=execute, shift=shift, spec=spec, tokenizer=tokenizer, **widths)
-        self.steps, self.copies, self.place, self.statistics = steps, copies, place, statistics
+        self.steps, self.copies, self.place, self.statistics, self.prefix = steps, copies, place, statistics, prefix
+        require_prefix(prefix, self.execute, chunk)
         origin = None if trunk is None else Trunk(trunk)
         self.cameras = _cameras(cameras, spec, origin)
         self.network = network() if origin is None else origin.build(network)
@@ -116,7 +122,7 @@ class VisionLanguageAction(Model):
         """Sample standard normal noise, (1, k, A)."""
         return torch.randn(1, *self.noise.shape, generator=random)
 
-    def prefix(self, batch: Batch) -> Prefix:
+    def known(self, batch: Batch) -> Prefix:
         """Encode the newest frame and the sentence."""
         images = torch.stack([self.image(batch["rgb"][camera][:, -1]) for camera in self.cameras], 1)
         present = images.new_ones(images.shape[:2], dtype=torch.bool)
@@ -133,13 +139,17 @@ class VisionLanguageAction(Model):
         return 2 * x - 1
 
     def noised(self, batch: Batch) -> Batch:
-        """Return a batch with "noise", (R·B, k, A), and "time", (R·B,), which outside training are always the same."""
+        """Return a batch with "noise", (R·B, k, A), "time" and "length" of the given prefix, (R·B,).
+
+        Outside training they are always the same.
+        """
         generator = None if self.training else torch.Generator().manual_seed(0)
         count = self.copies * len(batch["state"])
         noise = torch.randn(count, *self.noise.shape, generator=generator)
         uniform = torch.rand(count, generator=generator)
         time = MIN_TIME + (1 - MIN_TIME) * uniform ** (1 / SHAPE)  # uniform ** (2 / 3) ~ Beta(1.5, 1)
-        return {**batch, "noise": noise.to(self.noise), "time": time.to(self.noise)}
+        length = torch.randint(self.prefix + 1, (count,), generator=generator).to(self.noise.device)
+        return {**batch, "noise": noise.to(self.noise), "time": time.to(self.noise), "length": length}
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the scalar `loss` at the noise and times of the batch, or at random ones, and its parts by name."""
@@ -148,13 +158,17 @@ class VisionLanguageAction(Model):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return velocity and target, (R·B, k, A) each."""
         copies = len(batch["time"]) // len(batch["state"])
-        prefix = repeated(self.prefix(batch), copies)
-        action = self.padded(batch["action"][:, -1]).repeat(copies, 1, 1)
-        noise, time = batch["noise"], batch["time"][:, None, None]
-        velocity = self.network.velocity(prefix, time * noise + (1 - time) * action, batch["time"])
-        return {"velocity": velocity, "target": noise - action}
+        prefix = repeated(self.known(batch), copies)
+        action = self.scaled(batch["action"][:, -1]).repeat(copies, 1, 1)
+        noise, time = batch["noise"], batch["time"]
+        noisy = time[:, None, None] * noise + (1 - time)[:, None, None] * action
+        if self.prefix:
+            executed = self.scaled(batch["executed"][:, -1]).repeat(copies, 1, 1)
+            noisy, progress = with_prefix(noisy, 1 - time, executed, batch["length"])
+            time = 1 - progress
+        return {"velocity": self.network.velocity(prefix, noisy, time), "target": noise - action}
 
-    def padded(self, action: Tensor) -> Tensor:
+    def scaled(self, action: Tensor) -> Tensor:
         """Normalise (…, D) actions, and pad them to (…, A)."""
         return F.pad(self.action_normalizer(action), (0, self.network.action_width - action.shape[-1]))
 
@@ -162,16 +176,19 @@ class VisionLanguageAction(Model):
         """Return the mean squared error of the velocity of valid actions, without padding."""
         components = len(self.spec.action)
         error = (output["velocity"] - output["target"])[..., :components].square().mean(-1)
-        return {"action_loss": mean_where(error, batch["valid"][:, -1].repeat(len(error) // len(batch["valid"]), 1))}
+        counted = batch["valid"][:, -1].repeat(len(error) // len(batch["valid"]), 1)
+        if self.prefix:
+            counted = counted & (torch.arange(self.chunk, device=counted.device) >= batch["length"].unsqueeze(1))
+        return {"action_loss": mean_where(error, counted)}
 
     def predict(self, batch: Batch) -> Prediction:
         """Move the "noise" of the batch, or else a fixed noise, to actions."""
-        prefix = self.prefix(batch)
+        prefix = self.known(batch)
         noise = batch["noise"] if "noise" in batch else self.noise.expand(len(prefix.present), -1, -1)
+        velocity = self.continued(lambda x, progress: -self.network.velocity(prefix, x, 1 - progress), batch)
         x = noise
         for step in range(self.steps):
-            time = x.new_full((len(x),), 1 - step / self.steps)
-            x = x - self.network.velocity(prefix, x, time) / self.steps
+            x = x + velocity(x, x.new_full((len(x),), step / self.steps)) / self.steps
         return Prediction(self.action_normalizer.inverse(x[..., : len(self.spec.action)]))
 
 
