@@ -56,17 +56,18 @@ def main(size: str, cameras: int, *options: str) -> None:
     state, present = torch.randn(1, 32, generator=random), torch.ones(1, cameras, dtype=torch.bool)
     noise = torch.randn(1, CHUNK, 32, generator=random)
     split = [*images.unbind(1)], [*present.unbind(1)], tokens, sentence, state
+    said = tokens[:, :16], sentence[:, :16]  # `Prompt` pads no further
     run = torch.compile(sampled) if "compile" in options else sampled
     ways: dict[str, Callable[[], Any]] = {
         "LeRobot": lambda: theirs.sample_actions(*split, noise=noise),
-        "vla": lambda: run(ours, noise, images, present, tokens, sentence, state),
-        "vla, prefix alone": lambda: ours.prefix(images, present, tokens, sentence, state),
+        "vla": lambda: run(ours, noise, images, present, *said, state),
+        "vla, prefix alone": lambda: ours.prefix(images, present, *said, state),
     }
     if "bf16" in options:
 
         def half() -> Tensor:
             with torch.autocast("cpu", torch.bfloat16):
-                return run(ours, noise, images, present, tokens, sentence, state)
+                return run(ours, noise, images, present, *said, state)
 
         ways["vla, bf16"] = half
     count = sum(weight.numel() for weight in ours.parameters())

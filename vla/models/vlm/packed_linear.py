@@ -9,7 +9,11 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
+from transformers.activations import GELUTanh
+from transformers.models.siglip.modeling_siglip import SiglipMLP
+from transformers.models.smolvlm.modeling_smolvlm import SmolVLMVisionMLP
 
 Packed = tuple[tuple[int, int], Tensor]  # address and version of a weight, and the weight in another layout
 PACKED: WeakKeyDictionary[nn.Module, Packed] = WeakKeyDictionary()  # no part of modules, which are saved and copied
@@ -29,17 +33,37 @@ class PackedLinear(nn.Linear):
 
     def forward(self, input: Tensor) -> Tensor:
         """Map (…, inputs) to (…, outputs)."""
-        plain = (
-            torch.compiler.is_compiling() or not torch.is_inference_mode_enabled() or torch.is_autocast_enabled("cpu")
-        )
-        if plain or input.device.type != "cpu" or self.weight.dtype != torch.float32:
-            return super().forward(input)
+        return super().forward(input) if self._plain(input) else self._packed(input, "none", "")
+
+    def gelu(self, input: Tensor) -> Tensor:
+        """Map (…, inputs) to (…, outputs), followed by GELU with its approximation by tanh."""
+        if self._plain(input):
+            return F.gelu(super().forward(input), approximate="tanh")
+        return self._packed(input, "gelu", "tanh")
+
+    def _plain(self, input: Tensor) -> bool:
+        acts = torch.is_inference_mode_enabled() and not torch.compiler.is_compiling()
+        known = input.device.type == "cpu" and self.weight.dtype == torch.float32
+        return not (acts and known) or torch.is_autocast_enabled("cpu")
+
+    def _packed(self, input: Tensor, then: str, how: str) -> Tensor:
         key = self.weight.data_ptr(), self.weight._version
         packed = PACKED.get(self)
         if packed is None or packed[0] != key:
             rows = input.numel() // self.in_features
             packed = PACKED[self] = key, torch.ops.mkldnn._reorder_linear_weight(self.weight.detach(), rows)
-        return torch.ops.mkldnn._linear_pointwise(input, packed[1], self.bias, "none", [], "")
+        return torch.ops.mkldnn._linear_pointwise(input, packed[1], self.bias, then, [], how)
+
+
+class PackedMLP(nn.Module):
+    """The two linear maps of a layer of an image encoder, with GELU between them."""
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        """Map (…, width) to (…, width)."""
+        mlp: Any = self
+        if type(mlp.fc1) is PackedLinear:  # which LoRA may have replaced
+            return mlp.fc2(mlp.fc1.gelu(hidden))
+        return mlp.fc2(mlp.activation_fn(mlp.fc1(hidden)))
 
 
 def pack(network: nn.Module) -> None:
@@ -50,3 +74,6 @@ def pack(network: nn.Module) -> None:
         if type(module) is nn.Linear:
             changed: Any = module
             changed.__class__ = PackedLinear
+        elif type(module) in (SiglipMLP, SmolVLMVisionMLP) and isinstance(module.activation_fn, GELUTanh):
+            changed = module
+            changed.__class__ = PackedMLP

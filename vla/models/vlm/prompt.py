@@ -20,6 +20,7 @@ from vla.models.text.ngrams import TextEncoder
 
 PADDING = -1
 FILE = "tokenizer.json"
+STEP = 16  # tokens: few lengths, so that a program compiled for each can be kept
 BINS = 256  # of a normalised state in -1 … 1
 TRIED = "Task: pick it up, State: -1 0 255;\nAction: "
 
@@ -65,14 +66,17 @@ class Prompt(TextEncoder):
                 )
 
     def tokenize(self, sentences: list[str]) -> Tensor:
-        """Return (B, L) int64 tokens, `PADDING` after the end."""
+        """Return (B, L) int64 tokens, `PADDING` after the end; L is that of the longest sentence, in steps of 16."""
         texts = [
             f"Task: {_clean(each)}, State:" if self.state else each.removesuffix("\n") + "\n" for each in sentences
         ]
-        return _padded([self._ids(text, special=True)[: self.length] for text in texts], self.length)
+        rows = [self._ids(text, special=True)[: self.length] for text in texts]
+        longest = max(map(len, rows))
+        return _padded(rows, min(self.length, -longest % STEP + longest))
 
     def forward(self, tokens: Tensor, state: Tensor | None = None) -> Tensor:
-        """Return the (B, L) tokens of whole prompts for the output of `tokenize` and the (B, S) normalised state."""
+        """Return the tokens of whole prompts, (B, L) at most, given the output of `tokenize` and the (B, S) normalised
+        state."""
         if not self.state:
             return tokens
         assert state is not None

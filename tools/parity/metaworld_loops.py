@@ -1,0 +1,74 @@
+"""Compare LeRobot's evaluation of a policy on Meta-World with that of this project, episode by episode.
+
+    python tools/parity/metaworld_loops.py RUN 1000000 FOLDER...
+
+The folders are the `--output_dir` of `lerobot-eval --env.type=metaworld --seed=1000000`, which plays episode i of every
+task with the seed 1000000 + i. Here the policy plays the same in the world that it was trained in.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vla.api import load_environment, load_policy
+from vla.models.policy_folder import read_policy
+from vla.rollouts.comparison import Pairs, compare_pairs
+from vla.rollouts.rollout import rollout
+from vla.rollouts.statistics import wilson_interval
+
+
+def theirs(folder: Path) -> Iterator[tuple[str, list[bool]]]:
+    """Yield the tasks of an evaluation by LeRobot, with the success of each episode."""
+    for each in json.loads((folder / "eval_info.json").read_text(encoding="utf-8"))["per_task"]:
+        yield each["task_group"].removesuffix("-v3"), each["metrics"]["successes"]
+
+
+def ours(run: str, task: str, seeds: range) -> list[bool]:
+    """Return the success of each episode here."""
+    world, policy = load_environment(run, changes={"tasks": [task]}), load_policy(run, device="cpu")
+    played = [rollout(world.environment, policy, seed).success for seed in seeds]
+    world.close()
+    return played
+
+
+def main(run: str, first: str, *folders: str) -> None:
+    """Print the successes in both, by task, and compare them in pairs."""
+    tiers: dict[str, Any] = read_policy(run).config["task"]["tiers"]
+    both: dict[str, tuple[list[bool], list[bool]]] = {}
+    for folder in folders:
+        for task, there in theirs(Path(folder)):
+            here = ours(run, task, range(int(first), int(first) + len(there)))
+            both[task] = here, there
+            print(f"{task:28} here {sum(here)}, in LeRobot {sum(there)} of {len(there)}", flush=True)
+    for number, place in enumerate(("here", "in LeRobot")):
+        won = [success for pair in both.values() for success in pair[number]]
+        low, high = wilson_interval(sum(won), len(won))
+        means = [
+            np.mean([np.mean(both[task][number]) for task in tasks if task in both])
+            for tasks in tiers.values()
+            if {*tasks} & {*both}
+        ]
+        print(
+            f"{place}: {sum(won)} of {len(won)}, {100 * low:.1f}-{100 * high:.1f} %, tiers {100 * np.mean(means):.1f}"
+        )
+    episodes = [pair for here, there in both.values() for pair in zip(here, there, strict=True)]
+    both_won, lost, won = (
+        sum(pair == kind for pair in episodes) for kind in ((True, True), (True, False), (False, True))
+    )
+    result = compare_pairs(Pairs(both_won, lost, won, len(episodes) - both_won - lost - won))
+    print(
+        f"in LeRobot minus here: {100 * result.difference:.1f} points ({100 * result.ci_low:.1f} to "
+        f"{100 * result.ci_high:.1f}), {won} won, {lost} lost, p = {result.p:.3f}"
+    )
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 4:
+        sys.exit(__doc__)
+    main(*sys.argv[1:])
