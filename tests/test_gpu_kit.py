@@ -21,13 +21,14 @@ ROOT = Path(__file__).parents[1]
 
 def test_the_steps_leave_their_figures(tmp_path: Path) -> None:
     script = [sys.executable, str(ROOT / "tools/gpu/minutes.py"), str(tmp_path / "out")]
-    asked = ["a", "b", "g", "--dry", "--total", "600", "--work", str(tmp_path / "work")]
+    asked = ["a", "b", "g", "v", "--dry", "--total", "600", "--work", str(tmp_path / "work")]
     done = subprocess.run([*script, *asked], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    facts, collected, trained = (json.loads((tmp_path / f"out/{step}.json").read_text()) for step in "abg")
+    facts, collected, trained, large = (json.loads((tmp_path / f"out/{step}.json").read_text()) for step in "abgv")
     assert facts["cores"] and facts["torch"] and "limits" not in facts
     assert collected["collect"]["status"] == 0 and "6 episodes" in " ".join(collected["collect"]["log"])
     assert trained["bc"]["training"]["steps"] == 3 and trained["bc"]["metrics"][0]["train/loss"] > 0
+    assert large["smolvla_tiny"]["training"]["steps"] == 10 and "smolvla_tiny,model/text=utf8" in large["latency"]
     assert sum(trained["bc_evaluated"]["outcomes"].values()) == 1 and trained["bc_evaluated"]["latency_ms"] > 0
 
 

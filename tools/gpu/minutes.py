@@ -43,10 +43,13 @@ class Sizes(NamedTuple):
     precision: str
     compiled: bool
     trainer: str
+    vlas: dict[str, str]  # vision-language-action model → what LoRA freezes
     slower: int = 1  # factor of all limits
 
 
-DRY = Sizes(1, 6, 3, 6, "rt1_tiny", 4, 2, 3, 1, 3, "fp32", False, "cpu", 10)
+TINY = {"smolvla_tiny": "network.vlm"}
+FULL = {"smolvla": "network.vlm", "pi0": "network.paligemma"}
+DRY = Sizes(1, 6, 3, 6, "rt1_tiny", 4, 2, 3, 1, 3, "fp32", False, "cpu", TINY, 10)
 
 
 def real() -> Sizes:
@@ -54,7 +57,7 @@ def real() -> Sizes:
     query = ["nvidia-smi", "--query-gpu=memory.total", "--format=csv,noheader,nounits"]
     memory = int(subprocess.run(query, capture_output=True, text=True, check=True).stdout.split()[0])  # [MiB]
     batch = 40 if memory > 100_000 else 24
-    return Sizes(os.cpu_count() or 1, 2000, 1000, 500, "rt1", batch, 12, 2000, 200, 200, "bf16", True, "gpu")
+    return Sizes(os.cpu_count() or 1, 2000, 1000, 500, "rt1", batch, 12, 2000, 200, 200, "bf16", True, "gpu", FULL)
 
 
 class Minutes:
@@ -243,6 +246,18 @@ class Minutes:
             what = ["model=rt1_tiny", "validate.episodes=0", f"trainer.precision={sizes.precision}"]
             self.vla("f", strategy, 60, "job=train", *where, *length, *what, *self.data(sizes.used))
 
+    def v(self) -> None:
+        """Take ten steps of LoRA with vision-language-action models of random weights, and time their plans."""
+        sizes = self.sizes
+        for name, frozen in sizes.vlas.items():
+            what = [f"model={name}", "model/text=utf8", "learner=smolvla", "learner/lora=low_rank", "data.batch_size=8"]
+            length = ["trainer.max_steps=10", f"trainer.val_check_interval={NEVER}", "validate.episodes=0"]
+            how = [f"trainer={sizes.trainer}", f"trainer.precision={sizes.precision}", f"learner.frozen=[{frozen}]"]
+            self.vla("v", name, 120, "job=train", *what, *length, *how, *self.data(sizes.used))
+        models = [f"{name},model/text=utf8" for name in sizes.vlas]
+        asked = [str(self._demonstrations), str(sizes.used), str(sizes.plans), str(sizes.compiled)]
+        self.run("v", "plans", 110, sys.executable, str(PROBE), "latency", str(self.out / "v.json"), *asked, *models)
+
     def h(self) -> None:
         """Time rendering, other sizes of a batch, and TensorFloat-32."""
         sizes = self.sizes
@@ -268,7 +283,7 @@ def _ended(process: subprocess.Popen[bytes], limit: float) -> int | str:
 
 
 STEPS: dict[str, Callable[[Minutes], None]] = {
-    name: getattr(Minutes, name) for name in ("a", "b", "g", "c", "e", "d", "f", "h")
+    name: getattr(Minutes, name) for name in ("a", "b", "g", "c", "e", "d", "f", "v", "h")
 }
 
 

@@ -117,7 +117,7 @@ def latency(file: Path, demonstrations: str, episodes: str, plans: str, compiled
 
     store, found = EpisodeStore(Path(demonstrations), int(episodes)), dict[str, Any]()
     for name in models:
-        config = compose("job=train", f"model={name}", f"collect.folder={demonstrations}", "output=unused")
+        config = compose("job=train", *f"model={name}".split(","), f"collect.folder={demonstrations}", "output=unused")
         model = Experiment.of(config).fitted_learner(store).model
         for precision in ("fp32", "bf16")[: 1 + torch.cuda.is_available()]:
             for graphs in (False, True)[: 1 + (compiled == "True")]:
