@@ -3,7 +3,8 @@
     python tools/parity/metaworld_loops.py RUN 1000000 FOLDER...
 
 The folders are the `--output_dir` of `lerobot-eval --env.type=metaworld --seed=1000000`, which plays episode i of every
-task with the seed 1000000 + i. Here the policy plays the same in the world that it was trained in.
+task with the seed 1000000 + i; a further folder of the same tasks goes on with the next seed. Here the policy plays the
+same in the world that it was trained in.
 """
 
 from __future__ import annotations
@@ -43,8 +44,10 @@ def main(run: str, first: str, *folders: str) -> None:
     both: dict[str, tuple[list[bool], list[bool]]] = {}
     for folder in folders:
         for task, there in theirs(Path(folder)):
-            here = ours(run, task, range(int(first), int(first) + len(there)))
-            both[task] = here, there
+            before = both.setdefault(task, ([], []))
+            seed = int(first) + len(before[0])
+            here = ours(run, task, range(seed, seed + len(there)))
+            both[task] = before[0] + here, before[1] + there
             print(f"{task:28} here {sum(here)}, in LeRobot {sum(there)} of {len(there)}", flush=True)
     for number, place in enumerate(("here", "in LeRobot")):
         won = [success for pair in both.values() for success in pair[number]]
