@@ -23,7 +23,7 @@ from vla.deploy.client_observation import Keys
 from vla.parallel.pool import THIS_PROCESS
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import rollout
-from vla.spec import Array, Multitask, Spec
+from vla.spec import Array, Multitask, Observation, Spec
 from vla.tasks.metaworld import package
 from vla.tasks.metaworld.environment import MetaWorld, _command
 from vla.tasks.metaworld.expert import Scripted
@@ -239,13 +239,17 @@ def test_anybody_who_has_lerobots_picture_and_the_state_gives_the_images_of_the_
     wide = world(chosen[0], "task.image_size=[480,480]", chosen[2])
     ours = world(*chosen, "task.drawn=480", "task.image_size=[96,96]", "task.window=[0.25,0.29,0.95,0.99]")
     keys = Keys({"picture": "image"}, ["state"], "prompt")
-    assert keys.cameras(ours.spec) == ["picture"] and keys.cameras(wide.spec) == ["corner2"]
+    assert ours.spec.given(keys.images) == ["picture"] and wide.spec.given(keys.images) == ["corner2"]
     for seed in (0, 1):
         for whole, cut in zip(played(wide, seed, 12), played(ours, seed, 12), strict=True):
             sent = {"image": whole.rgb["corner2"], "state": whole.state, "prompt": whole.instruction}
             shown = ours.spec.images(keys.observation(sent, ours.spec))
             for camera in ("corner2", "hand"):
                 np.testing.assert_array_equal(shown[camera], cut.rgb[camera])
+    given = {"picture": whole.rgb["corner2"], "state": whole.state, "instruction": "Reach a goal position"}
+    assert {*Observation.from_mapping(given, ours.spec).rgb} == {"picture"}
+    with pytest.raises(ValueError, match=r'^the image "picture" must be \(H, W, 3\) uint8, and is float32 of \(480,'):
+        ours.spec.images(Observation({"picture": np.zeros((480, 480), np.float32)}, whole.state, ""))
     assert Spec.from_dict(ours.spec.to_dict()) == ours.spec
     wide.close()
     ours.close()

@@ -6,7 +6,7 @@ Tasks, data and models exchange only the types below: they import this module an
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Literal, Protocol, runtime_checkable
@@ -125,6 +125,11 @@ class Spec:
                 f'as "{PICTURE}", or the part in {width} by {height} pixels'
             )
 
+    def given(self, names: Container[str]) -> list[str]:
+        """Return the images that are to be given: all cameras, or the whole picture, if named, in place of parts."""
+        whole = self.parts and PICTURE in names
+        return [PICTURE, *(name for name in self.cameras if name not in self.cut)] if whole else [*self.cameras]
+
     def images(self, observation: Observation) -> Mapping[str, Array]:
         """Return camera → image, of which parts that are missing are cut out of the whole picture if it is there."""
         state = dict(zip(self.state, observation.state, strict=False))
@@ -224,9 +229,10 @@ class Observation:
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], spec: Spec) -> Observation:
         """Take an observation of gymnasium: an image per camera, "state", "instruction"; a UserError if one lacks."""
-        if missing := [name for name in (*spec.cameras, "state", "instruction") if name not in values]:
+        cameras = spec.given(values)
+        if missing := [name for name in (*cameras, "state", "instruction") if name not in values]:
             raise UserError(f"the observation has {', '.join(map(str, values))}, but lacks {', '.join(missing)}")
-        rgb = {camera: values[camera] for camera in spec.cameras}
+        rgb = {camera: values[camera] for camera in cameras}
         return cls(rgb, values["state"], values["instruction"])
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from annotated_types import MinLen
 
 from vla.io.errors import UserError
-from vla.io.parts import PICTURE
 from vla.io.types import Text
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Running, Spec
 
@@ -25,17 +24,11 @@ class Keys:
     state: Annotated[list[Text], MinLen(1)]  # vectors to concatenate
     prompt: Text  # instruction
 
-    def cameras(self, spec: Spec) -> list[str]:
-        """Return what a client sends: all cameras, or the whole picture in place of those that show parts of it."""
-        if not spec.parts or PICTURE not in self.images:
-            return [*spec.cameras]
-        return [PICTURE, *(camera for camera in spec.cameras if camera not in spec.cut)]
-
     def observation(self, message: Any, spec: Spec) -> Observation:
         """Convert a client's observation, whose images may have any size; a UserError if it does not match the spec."""
         if not isinstance(message, Mapping):
             raise UserError(f"an observation is a map, not {type(message).__name__}")
-        cameras = self.cameras(spec)
+        cameras = spec.given(self.images)
         wanted = [*(self.images[camera] for camera in cameras), *self.state, self.prompt]
         found = {key: _find(message, key) for key in wanted}
         if missing := [key for key, value in found.items() if value is None]:

@@ -86,9 +86,8 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
         UserError: an entry is missing or has another shape.
     """
     parts = _parts(spec)
-    keys = {camera: f"{IMAGES}{camera}" for camera in spec.cameras}
-    if spec.parts and WHOLE in batch:
-        keys = {PICTURE: WHOLE, **{camera: key for camera, key in keys.items() if camera not in spec.cut}}
+    given = spec.given([PICTURE] if WHOLE in batch else [])
+    keys = {name: WHOLE if name == PICTURE else f"{IMAGES}{name}" for name in given}
     needed = [*keys.values(), *parts, TASK]
     if missing := [key for key in needed if key not in batch]:
         raise UserError(f"the policy needs {', '.join(missing)}; there are {', '.join(map(str, batch))}")

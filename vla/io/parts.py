@@ -11,6 +11,7 @@ from annotated_types import Ge, Le, MaxLen, MinLen, Predicate
 from PIL import Image
 
 from vla.io.documents import STRICT
+from vla.io.errors import UserError
 from vla.io.types import names_a_file
 
 Array = np.ndarray
@@ -65,7 +66,13 @@ class Part:
 
 
 def cut(picture: Array, window: Sequence[float] | Array, size: tuple[int, int]) -> Array:
-    """Return a window of a picture (H, W, 3) uint8, averaged over areas to a size: height and width [px]."""
+    """Return a window of a picture (H, W, 3) uint8, averaged over areas to a size: height and width [px].
+
+    Raises:
+        UserError: the picture has another shape or type.
+    """
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
+        raise UserError(f'the image "{PICTURE}" must be (H, W, 3) uint8, and is {picture.dtype} of {picture.shape}')
     height, width = picture.shape[:2]
     top, left, bottom, right = np.array(window) * (height, width, height, width)
     image = Image.fromarray(picture).resize(size[::-1], Image.Resampling.BOX, (left, top, right, bottom))
