@@ -20,6 +20,7 @@ from replaying import played, same
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.deploy.client_observation import Keys
+from vla.envs.lerobot import IMAGE, STATE, TASK, observations
 from vla.parallel.pool import THIS_PROCESS
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import rollout
@@ -246,6 +247,10 @@ def test_anybody_who_has_lerobots_picture_and_the_state_gives_the_images_of_the_
             shown = ours.spec.images(keys.observation(sent, ours.spec))
             for camera in ("corner2", "hand"):
                 np.testing.assert_array_equal(shown[camera], cut.rgb[camera])
+    picture = whole.rgb["corner2"].transpose(2, 0, 1)[None] / np.float32(255)
+    batch = {IMAGE: picture, STATE: whole.state[None], TASK: [whole.instruction]}
+    (seen,) = observations(batch, ours.spec)
+    np.testing.assert_array_equal(ours.spec.images(seen)["hand"], cut.rgb["hand"])
     given = {"picture": whole.rgb["corner2"], "state": whole.state, "instruction": "Reach a goal position"}
     assert {*Observation.from_mapping(given, ours.spec).rgb} == {"picture"}
     with pytest.raises(ValueError, match=r'^the image "picture" must be \(H, W, 3\) uint8, and is float32 of \(480,'):

@@ -16,8 +16,8 @@ from annotated_types import Ge, Le, MaxLen, MinLen, Predicate
 
 from vla.io.documents import STRICT, parse_plain
 from vla.io.errors import UserError
-from vla.io.parts import PICTURE, Part, with_parts
-from vla.io.types import Count, Point, Positive, names_a_file, unique
+from vla.io.parts import PICTURE, Camera, Name, Part, with_parts
+from vla.io.types import Count, Point, Positive, unique
 
 Array = np.ndarray
 
@@ -27,9 +27,7 @@ LONGEST_INSTRUCTION = 1000  # characters
 
 
 # Limits of a spec that is read from a file.
-Name = Annotated[str, MinLen(1), MaxLen(100)]
 Names = Annotated[tuple[Name, ...], MinLen(1), MaxLen(100), Predicate(unique)]
-Camera = Annotated[Name, Predicate(names_a_file)]
 Cameras = Annotated[tuple[Camera, ...], MinLen(1), MaxLen(100), Predicate(unique)]
 Pixels = Annotated[int, Ge(1), Le(4096)]
 Units = Annotated[tuple[Name, ...], MaxLen(100)]
@@ -132,6 +130,8 @@ class Spec:
 
     def images(self, observation: Observation) -> Mapping[str, Array]:
         """Return camera → image, of which parts that are missing are cut out of the whole picture if it is there."""
+        if PICTURE not in observation.rgb:
+            return observation.rgb
         state = dict(zip(self.state, observation.state, strict=False))
         return with_parts(observation.rgb, state, self.parts, self.image_size)
 

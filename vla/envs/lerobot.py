@@ -19,7 +19,7 @@ from vla.io.errors import UserError
 from vla.io.parts import PICTURE
 from vla.spec import FIRST_SEED, Array, Observation, Spec
 
-IMAGES, WHOLE = "observation.images.", "observation.image"  # of cameras, and of an environment with one
+IMAGES, IMAGE = "observation.images.", "observation.image"  # of cameras, and of an environment with one
 STATE, RATES = "observation.state", "observation.velocities"
 TASK = "task"  # the instructions
 AGENT = {STATE: "agent_pos", RATES: "velocities"}  # what an environment calls them, before LeRobot renames them
@@ -86,8 +86,8 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
         UserError: an entry is missing or has another shape.
     """
     parts = _parts(spec)
-    given = spec.given([PICTURE] if WHOLE in batch else [])
-    keys = {name: WHOLE if name == PICTURE else f"{IMAGES}{name}" for name in given}
+    given = spec.given([PICTURE] if IMAGE in batch else [])
+    keys = {name: IMAGE if name == PICTURE else f"{IMAGES}{name}" for name in given}
     needed = [*keys.values(), *parts, TASK]
     if missing := [key for key in needed if key not in batch]:
         raise UserError(f"the policy needs {', '.join(missing)}; there are {', '.join(map(str, batch))}")

@@ -17,9 +17,10 @@ from vla.io.types import names_a_file
 Array = np.ndarray
 
 PICTURE = "picture"  # in place of a camera: the whole picture
-WHOLE = (0.0, 0.0, 1.0, 1.0)
+WHOLE = (0.0, 0.0, 1.0, 1.0)  # window of all of it: top, left, bottom, right
 
 Name = Annotated[str, MinLen(1), MaxLen(100)]
+Camera = Annotated[Name, Predicate(names_a_file)]
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Part:
 
     __pydantic_config__ = STRICT
 
-    camera: Annotated[Name, Predicate(names_a_file)]
+    camera: Camera
     window: Annotated[tuple[float, ...], MinLen(4), MaxLen(4)] = WHOLE  # of a part that moves: where its middle is 0, 0
     point: Annotated[tuple[Name, ...], MaxLen(3)] = ()  # (3,) state components, a place [m]; none: it does not move
     offset: Annotated[tuple[float, ...], MaxLen(3)] = ()  # (3,) from that place to the middle of the part [m]
@@ -82,16 +83,14 @@ def cut(picture: Array, window: Sequence[float] | Array, size: tuple[int, int]) 
 def with_parts(
     images: Mapping[str, Array], state: Mapping[str, float], parts: Sequence[Part], size: tuple[int, int]
 ) -> Mapping[str, Array]:
-    """Add the images (size, 3) of the parts that are missing, cut out of the whole picture if there is one.
+    """Add the images (size, 3) of the parts that are missing, cut out of the whole picture.
 
     Args:
-        images: camera, or `PICTURE`, → (H, W, 3) uint8.
+        images: camera → (H, W, 3) uint8, and `PICTURE`.
         state: component → its value.
         parts: where they are.
         size: height and width [px] of what is cut out.
     """
-    if PICTURE not in images:
-        return images
     missing = [part for part in parts if part.camera not in images]
     places = [np.array([state[name] for name in part.point], np.float64) for part in missing]
     return {

@@ -102,7 +102,7 @@ def require_chunking(method: type, model: type, prefix: int) -> None:
 
 def require_prefix(prefix: int, execute: int, chunk: int) -> None:
     """Raise a UserError if actions that training gives leave fewer of a chunk than are executed."""
-    if prefix and prefix + execute > chunk:
+    if prefix + execute > chunk:
         left = f"less than {execute} of the model.chunk={chunk} actions"
         raise UserError(
             f"model.prefix={prefix} leaves {left}, which are executed: lower it or model.execute, or raise model.chunk"

@@ -9,7 +9,7 @@ from typing import Any
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import ACTION
 
-from vla.envs.lerobot import IMAGES, RATES, STATE, WHOLE
+from vla.envs.lerobot import IMAGE, IMAGES, RATES, STATE
 from vla.models.policy_folder import read_policy
 
 
@@ -46,7 +46,7 @@ class VlaConfig(PreTrainedConfig):
         """
         spec = read_policy(checkpoint).spec
         vectors = {STATE: len(spec.pose), **({RATES: len(spec.rates)} if spec.rates else {})}
-        images = [*(f"{IMAGES}{name}" for name in spec.cameras), *([WHOLE] if spec.parts else [])]
+        images = [*(f"{IMAGES}{name}" for name in spec.cameras), *([IMAGE] if spec.parts else [])]
         self.input_features = {
             **{key: PolicyFeature(FeatureType.VISUAL, (3, *spec.image_size)) for key in images},
             **{key: PolicyFeature(FeatureType.STATE, (size,)) for key, size in vectors.items()},

@@ -52,7 +52,7 @@ class TaskScene:
                 f"task.cameras names {', '.join(unknown)}; Meta-World has {', '.join(known)}, and {HAND}, which is "
                 f"the part of {CAMERA} around the hand"
             )
-        camera = self._camera = known.index(CAMERA)
+        camera = known.index(CAMERA)
         model.cam_pos[camera] = CAMERA_PLACE
         model.cam_quat[camera] = _turned()
         model.vis.quality.shadowsize = settings.shadows

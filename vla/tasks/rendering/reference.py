@@ -7,9 +7,10 @@ from collections.abc import Collection, Sequence
 import mujoco
 import numpy as np
 
+from vla.io.parts import WHOLE
 from vla.spec import Array
 from vla.tasks.rendering.projections import clip_range
-from vla.tasks.rendering.renderer import WHOLE, Views
+from vla.tasks.rendering.renderer import Views
 
 
 class Reference:

@@ -10,8 +10,6 @@ import mujoco
 
 from vla.spec import Array
 
-WHOLE = (0.0, 0.0, 1.0, 1.0)  # window of all that a camera sees: top, left, bottom, right
-
 
 @dataclass(frozen=True)
 class Views:
