@@ -100,7 +100,7 @@ class WindowBatcher:
         self._ages, self._aheads = np.arange(1 - history, 1), np.arange(chunk)
         cameras = {"rgb": store.spec.cameras, **({"depth": store.spec.depth} if depth else {})}
         self._images = {kind: {name: store.rows(f"{kind}_{name}", True) for name in of} for kind, of in cameras.items()}
-        # One array: the row look-up costs more than the copy of a few numbers.
+        # Two arrays, of frames and of labels: the row look-up costs more than the copy of a few numbers.
         names = ("state", *(("truth",) if store.spec.truth else ()))
         numbers = {name: store.rows(name) for name in (*names, "action", "executed")}
         store.verify(store.episodes, numbers)
@@ -109,8 +109,9 @@ class WindowBatcher:
         # Truth that this store lacks, and others beside it have.
         unknown = np.full((len(known[0]), self._truth_size - store.spec.truth_size), np.nan, np.float32)
         self._numbers = np.concatenate([*known, unknown], axis=1)
-        self._action, self._executed = numbers["action"], numbers["executed"]
-        off = perturbed(self._action[:], self._executed[:], store.spec)
+        label, executed = numbers["action"][:], numbers["executed"][:]
+        self._actions, self._action_size = np.concatenate([label, executed], axis=1), label.shape[1]
+        off = perturbed(label, executed, store.spec)
         self._perturbations = np.append(0, off.cumsum())  # before each row
         self._store, self._entries = store, (entries := store.episodes)
         self._verified = np.zeros(len(entries), bool)  # images only
@@ -149,8 +150,8 @@ class WindowBatcher:
         batch["state"] = numbers[..., :state]
         if self._truth_size:
             batch["truth"] = numbers[..., state:]
-        batch["action"] = self._take(self._action, labels)
-        batch["executed"] = self._take(self._executed, labels)
+        actions = self._take(self._actions, labels)
+        batch["action"], batch["executed"] = actions[..., : self._action_size], actions[..., self._action_size :]
         batch["present"] = self._own(present)
         batch["valid"] = self._own(valid)
         batch["unperturbed"] = self._own(self._perturbations[labels[:, :, -1]] == self._perturbations[frames])
