@@ -43,7 +43,7 @@ def main(
 
     def see(batch: dict[str, Any]) -> dict[str, Any]:
         known = {key: value.numpy() if isinstance(value, torch.Tensor) else value for key, value in batch.items()}
-        seen = [arrays(replace(each, rgb=spec.images(each)), spec) for each in observations(known, spec)]
+        seen = [arrays(replace(each, rgb={**spec.images(each)}), spec) for each in observations(known, spec)]
         return {key: torch.from_numpy(np.stack([each[key] for each in seen])) for key in seen[0]} | {TASK: batch[TASK]}
 
     def act(batch: dict[str, Any]) -> dict[str, Any]:
