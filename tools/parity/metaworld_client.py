@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 from websockets.sync.client import ClientConnection, connect
 
-SIZE, STEPS = 480, 500  # [px], at most
+STEPS = 500  # at most
 UNITS = np.array([100, 100, 100, -1], np.float32)  # the simulator's actions are in cm, and 1 closes
 
 

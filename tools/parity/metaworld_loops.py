@@ -3,8 +3,8 @@
     python tools/parity/metaworld_loops.py RUN 1000000 FOLDER...
 
 The folders are the `--output_dir` of `lerobot-eval --env.type=metaworld --seed=1000000`, which plays episode i of every
-task with the seed 1000000 + i; a further folder of the same tasks goes on with the next seed. Here the policy plays the
-same in the world that it was trained in.
+task with the seed 1000000 + i, or the OUTPUT of `metaworld_client.py`; a further folder of the same tasks goes on with
+the next seed. Here the policy plays the same in the world that it was trained in.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 
 from vla.api import load_environment, load_policy
 from vla.models.policy_folder import read_policy
+from vla.policy import Policy
 from vla.rollouts.comparison import Pairs, compare_pairs
 from vla.rollouts.rollout import rollout
 from vla.rollouts.statistics import wilson_interval
@@ -30,9 +31,9 @@ def theirs(folder: Path) -> Iterator[tuple[str, list[bool]]]:
         yield each["task_group"].removesuffix("-v3"), each["metrics"]["successes"]
 
 
-def ours(run: str, task: str, seeds: range) -> list[bool]:
+def ours(run: str, policy: Policy, task: str, seeds: range) -> list[bool]:
     """Return the success of each episode here."""
-    world, policy = load_environment(run, changes={"tasks": [task]}), load_policy(run, device="cpu")
+    world = load_environment(run, changes={"tasks": [task]})
     played = [rollout(world.environment, policy, seed).success for seed in seeds]
     world.close()
     return played
@@ -42,11 +43,12 @@ def main(run: str, first: str, *folders: str) -> None:
     """Print the successes in both, by task, and compare them in pairs."""
     tiers: dict[str, Any] = read_policy(run).config["task"]["tiers"]
     both: dict[str, tuple[list[bool], list[bool]]] = {}
+    policy = load_policy(run, device="cpu")
     for folder in folders:
         for task, there in theirs(Path(folder)):
             before = both.setdefault(task, ([], []))
             seed = int(first) + len(before[0])
-            here = ours(run, task, range(seed, seed + len(there)))
+            here = ours(run, policy, task, range(seed, seed + len(there)))
             both[task] = before[0] + here, before[1] + there
             print(f"{task:28} here {sum(here)}, in LeRobot {sum(there)} of {len(there)}", flush=True)
     for number, place in enumerate(("here", "in LeRobot")):
