@@ -6,10 +6,14 @@ from pathlib import Path
 
 import pytest
 from composing import composed
+from torch import Tensor
 
 from vla.config.experiment import Experiment
-from vla.jobs.benchmark import loader
+from vla.io.errors import UserError
+from vla.jobs.benchmark import acting, loader
 from vla.jobs.benchmark.measure import machine, measure, other_load
+from vla.models.layers import Batch
+from vla.models.model import Model
 from vla.parallel.limits import cores
 
 
@@ -35,3 +39,26 @@ def test_large_images_are_loaded_and_their_size_is_extrapolated() -> None:
         speed, size = (found[f"loader: 3 x 224 px, {codec}{end}"] for end in ("", ", 2500 x 100 steps"))
         assert (speed["unit"], speed["n"], size["unit"]) == ("windows/s", 4, "GB") and speed["floor"] > 0
         assert 0 < size["value"] < 40 and size["floor"] == pytest.approx(112.9, abs=0.1)
+
+
+class Peer:
+    """Another implementation of a model, which is the model itself and errs by `error`."""
+
+    def __init__(self, model: Model, error: float) -> None:
+        self.model, self.error = model, error
+
+    def __call__(self, window: Batch) -> Tensor:
+        return self.model.predict(window).actions + self.error
+
+
+def test_another_implementation_of_equal_actions_is_the_floor_of_a_plan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VLA_TRUST", "test_benchmark")
+    peer = {"_target_": "test_benchmark.Peer", "_partial_": True, "error": 0.0}
+    small = ("benchmark.steps=3", "collect.episodes=1", f"collect.folder={tmp_path}", "task.image_size=[32,32]")
+    experiment = Experiment.of(composed("job=benchmark", *small)).with_values({"benchmark.peer": peer})
+    found = acting.policy(experiment)["policy"]
+    assert found["n"] == 3 and found["floor"] > 0
+    with pytest.raises(UserError, match=r"benchmark.peer plans other actions: they differ by \d"):
+        acting.policy(experiment.with_values({"benchmark.peer.error": 0.1}))

@@ -11,19 +11,17 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import SimpleNamespace
 from typing import Any
 
 import lerobot_modules  # first: it makes the imports of LeRobot possible  # noqa: F401
 import torch
 from fake_batch import as_policy
-from lerobot.policies.smolvla import smolvlm_with_expert
-from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy, VLAFlowMatching
 from lerobot.policies.smolvla.processor_smolvla import make_smolvla_pre_post_processors  # registers its steps
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
 from safetensors.torch import save_file
+from smolvla_peer import their_network, without_hub
 from tiny_vla import (
     CHUNK,
     REFERENCE,
@@ -67,21 +65,6 @@ def trunk_config(sizes: dict[str, Any]) -> SmolVLMConfig:
     return SmolVLMConfig(text_config=text, vision_config=vision, scale_factor=sizes["shuffle"])
 
 
-def without_hub(sizes: dict[str, Any]) -> None:
-    """Give LeRobot's class the trunk's configuration in place of the hub's."""
-    smolvlm_with_expert.AutoConfig = SimpleNamespace(from_pretrained=lambda *_: trunk_config(sizes))
-    tokens = SimpleNamespace(fake_image_token_id=3, global_image_token_id=4)
-    smolvlm_with_expert.AutoProcessor = SimpleNamespace(from_pretrained=lambda *_: SimpleNamespace(tokenizer=tokens))
-
-
-def their_network(sizes: dict[str, Any], chunk: int) -> VLAFlowMatching:
-    """LeRobot's network with random weights, of which nothing is frozen."""
-    without_hub(sizes)
-    frozen = {"freeze_vision_encoder": False, "train_expert_only": False}
-    length = {"chunk_size": chunk, "n_action_steps": chunk, "num_vlm_layers": sizes["layers"]}
-    return VLAFlowMatching(SmolVLAConfig(**length, **frozen, device="cpu")).eval()
-
-
 def their_results(network: VLAFlowMatching, given: dict[str, Tensor], gradients: list[str]) -> dict[str, Tensor]:
     """Losses, named gradients, and the noisy actions before every step of sampling and after the last."""
     images, cameras = ([*given[name].unbind(1)] for name in ("images", "cameras"))
@@ -110,7 +93,7 @@ def compare(name: str, ours: Tensor, theirs: Tensor) -> None:
 
 def compare_networks() -> dict[str, Tensor]:
     """Compare losses, gradients and every step of sampling; returns LeRobot's."""
-    theirs, ours = their_network(SMOLVLA, CHUNK), SmolVLA(**SMOLVLA).eval()
+    theirs, ours = their_network(trunk_config(SMOLVLA), CHUNK), SmolVLA(**SMOLVLA).eval()
     fill(theirs.named_parameters())
     fill(published(ours))
     unmatched = {name for name, _ in theirs.named_parameters()} ^ {name for name, _ in published(ours)}
@@ -129,7 +112,7 @@ def compare_policies(folder: Path) -> dict[str, Tensor]:
     model = make_smolvla(folder / "tokenizer")
     ours = as_policy(model, SPEC)
     LeRobotPolicyExporter(folder / "exported").export(ours)
-    without_hub(SMOLVLA)
+    without_hub(trunk_config(SMOLVLA))
     theirs = SmolVLAPolicy.from_pretrained(folder / "exported", strict=False)
     weights = dict(theirs.model.named_parameters())
     assert all(torch.equal(weights[name], weight) for name, weight in published(model.network))

@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
+from hydra.utils import instantiate
+from torch import Tensor
 
 from vla.config.compose import compose
 from vla.config.experiment import Experiment, plain
 from vla.config.nodes import Benchmark
+from vla.io.errors import UserError
 from vla.jobs.benchmark.measure import Measure, measure, timed
 from vla.jobs.collect import demonstrations
 
+EQUAL = 1e-4  # largest difference of equal actions, relative to the largest one
+
 
 def policy(experiment: Experiment) -> dict[str, Measure]:
-    """Measure the median latency of an action; the floor is the network alone, in float32 and not compiled."""
+    """Measure the median latency of a plan; the floor is the network alone, in float32 and not compiled.
+
+    With `benchmark.peer`, the floor is the same plan by another implementation with equal weights.
+
+    Raises:
+        UserError: the peer plans other actions.
+    """
     environment = experiment.make_environment()()
     observation = environment.reset(0)
     environment.close()
@@ -27,17 +37,26 @@ def policy(experiment: Experiment) -> dict[str, Measure]:
     for _ in range(model.history + 1):  # warm-up: compiles and allocates
         agent.act(observation)
     frame = agent.frame(observation)
-    steps = experiment.options(Benchmark).steps
-    acting = _median(lambda: agent.plan(observation), steps)
+    asked = experiment.options(Benchmark)
     with torch.inference_mode():
         kept = agent.window()
-        network = _median(lambda: (model.encode(frame), model.predict(kept).actions.cpu()), steps)
-    return {"policy": measure(acting, "ms", steps, network)}
+        if asked.peer:
+            floor = partial(instantiate(asked.peer, _convert_="all")(model), kept)
+            _require_equal(floor(), model.predict(kept).actions)
+        else:
+
+            def floor() -> object:
+                return model.encode(frame), model.predict(kept).actions.cpu()
+
+        times = np.array([[timed(partial(agent.plan, observation))[1], timed(floor)[1]] for _ in range(asked.steps)])
+    acting, network = 1000 * np.median(times, 0)
+    return {"policy": measure(acting, "ms", asked.steps, network)}
 
 
-def _median(work: Callable[[], object], rounds: int) -> float:
-    """Return the median duration of `work` [ms]."""
-    return 1000 * float(np.median([timed(work)[1] for _ in range(rounds)]))
+def _require_equal(theirs: Tensor, ours: Tensor) -> None:
+    off = float((theirs - ours).abs().max() / theirs.abs().max())
+    if not off <= EQUAL:
+        raise UserError(f"benchmark.peer plans other actions: they differ by {off:.1e} of the largest")
 
 
 def evaluate(experiment: Experiment) -> dict[str, Measure]:
