@@ -29,7 +29,7 @@ from vla.models.layers import RunningNormalizer
 from vla.models.model import Model
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile
-from vla.models.tokenizers.tokenizer import RT1Bins, Uniform
+from vla.models.tokenizers.tokenizer import RT1Bins
 
 MOTIONS = Motions()
 MODELS: dict[str, Callable[..., Model]] = {
@@ -130,24 +130,6 @@ def test_without_weight_there_is_no_auxiliary_head(name: str) -> None:
     model, batch = made(name, auxiliary=0.0)
     losses = model.loss(batch)
     assert losses["loss"] == losses["action_loss"] and "truth_loss" not in losses
-
-
-@pytest.mark.parametrize("name", ["bc", "bc chunk", "rt1", "rt1 chunk", "decoder", "decoder chunk"])
-def test_log_probabilities_of_actions_are_those_of_the_cross_entropy(name: str) -> None:
-    """With targets of one bin; and each of a decoder is given those before it, as in its training."""
-    model, batch = made(name, auxiliary=0.0)
-    model.eval().tokenizer = Uniform(64, 0.05, 0.0, 0, spec=SPEC)
-    batch["valid"][:, :-1] = False
-    found = model.log_probabilities(batch, batch["action"][:, -1])
-    assert found.shape == (4, model.chunk) and (found < 0).all()
-    assert -found.mean().item() / 3 == pytest.approx(model.loss(batch)["action_loss"].item(), rel=1e-5)
-
-
-@pytest.mark.parametrize(("name", "kinds"), [("act", "ACT with Uniform"), ("decoder fast", "Decoder with Fast")])
-def test_what_is_no_token_of_an_action_has_no_log_probability(name: str, kinds: str) -> None:
-    model, batch = made(name)
-    with pytest.raises(ValueError, match=f"{kinds} gives actions no probabilities"):
-        model.log_probabilities(batch, batch["action"][:, -1])
 
 
 def test_frames_that_are_padding_or_of_unknown_truth_do_not_count_in_the_auxiliary_loss() -> None:

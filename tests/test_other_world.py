@@ -28,7 +28,8 @@ from vla.data.verification import require_whole, verify_store
 from vla.policy import Policy
 from vla.reports.dataset_card import store_table, write_card
 from vla.reports.evaluation import plot_report, write_report
-from vla.reports.observations import save_contact_sheet
+from vla.reports.observations import reset_panels
+from vla.reports.pictures import save
 from vla.reports.run_page import write_page
 from vla.reports.sweep import tabulate
 from vla.rollouts.evaluate import evaluate
@@ -141,7 +142,7 @@ def test_a_store_is_verified_and_described(folder: Path) -> None:
 
 def test_resets_are_shown(tmp_path: Path) -> None:
     environment = toy.make_environment()
-    save_contact_sheet([0, 1], [environment.reset(seed) for seed in (0, 1)], tmp_path / "sheet.png")
+    save(tmp_path / "sheet.png", reset_panels([0, 1], [environment.reset(seed) for seed in (0, 1)]), 2)
     sheet = np.array(Image.open(tmp_path / "sheet.png").convert("RGB"), int)
     assert (np.ptp(sheet, axis=-1) > 60).sum() > 1000  # pixels in colour, of which text has none
 

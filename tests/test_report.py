@@ -15,7 +15,7 @@ from toy_recordable import make_environment
 
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.factors import factors
-from vla.reports.observations import draws_table, save_contact_sheet
+from vla.reports.observations import draws_table, reset_panels
 from vla.reports.pictures import save, svgs
 from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import wilson_interval
@@ -86,7 +86,7 @@ def test_texts_of_a_page_are_left_to_the_fonts_of_the_browser(tmp_path: Path) ->
 def test_a_contact_sheet_shows_the_observations(tmp_path: Path, figures: list[Figure]) -> None:
     environment, seeds = make_environment(), [FIRST_SEED, FIRST_SEED + 1, FIRST_SEED + 2]
     observations = [environment.reset(seed) for seed in seeds]
-    save_contact_sheet(seeds, observations, tmp_path / "sheet.png")
+    save(tmp_path / "sheet.png", reset_panels(seeds, observations), 2)
     for seed, seen, axes in zip(seeds, observations, figures[0].axes, strict=True):
         assert axes.get_title() == f"seed {seed}: {seen.instruction}"
         shown = np.asarray(axes.images[0].get_array())

@@ -470,6 +470,12 @@ def test_a_server_with_other_components_or_another_rate_is_noticed(caplog: pytes
         with pytest.raises(ValueError, match=r"its actions have 3 components, ours are x, y: set agent\.actions"):
             fewer.plan(observation)
         fewer.close()
+        large = {name: Component(index, 100.0, 5.0) for index, name in enumerate(SPEC.action)}
+        scaled = remote(url, actions=large)
+        for _ in range(2):
+            scaled.plan(observation)
+        scaled.close()
+    assert caplog.text.count("are far beyond the bounds of the world, to which they are clipped: set agent.act") == 1
     assert f"acts at {SPEC.control_hz:g} Hz, the world at 7 Hz" in caplog.text
 
 

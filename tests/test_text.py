@@ -18,7 +18,6 @@ from vla.config.build import check_node
 from vla.config.compose import axes
 from vla.models.text.colours import in_basic_terms
 from vla.models.text.ngrams import NGrams
-from vla.models.text.tensor_cache import TensorCache
 from vla.tasks.tabletop.scene import COLOURS
 
 SENTENCES = ["Lift the red block", "put the small green block onto the blue pad", ""]
@@ -162,23 +161,3 @@ def test_n_grams_are_short() -> None:
     node: Any = OmegaConf.to_container(OmegaConf.load(CONF / "model/text/ngrams.yaml"))
     with pytest.raises(ValueError, match=r"text\.words must be (greater|less) than or equal to 1"):
         check_node("text", {**node, "words": 2**31 - 1}, object)
-
-
-def test_a_cache_holds_what_was_used_last_within_its_bytes() -> None:
-    cache, made = TensorCache(20_000), list[str]()
-
-    def get(text: str, length: int) -> torch.Tensor:
-        return cache.get(text, lambda: made.append(text) or torch.zeros(length), length)
-
-    for text in ("a", "b", "a", "c", "a"):
-        assert get(text, 1000).shape == (1000,)
-    assert made == ["a", "b", "c"]
-    for number in range(100):
-        get(str(number), 1000)
-        get("a", 1000)
-        assert 0 < cache.size <= 20_000
-    assert made.count("a") == 1
-    get("huge", 10_000)
-    get("x" * 10_000, 1)
-    assert cache.size <= 20_000
-    assert get("a", 1).shape == (1,)

@@ -16,7 +16,7 @@ from vla.models.model import Model
 from vla.policy import Policy
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.rollout import rollout
-from vla.rollouts.worlds import Stage, Worlds, in_lanes, play
+from vla.rollouts.worlds import Stage, in_lanes, play
 from vla.spec import FIRST_SEED, Array, Episode, Observation
 
 MODELS: dict[str, Callable[[], Model]] = {
@@ -36,8 +36,8 @@ class Short(ToyEnvironment):
         return seen
 
 
-def worlds(lanes: int, make: Callable[[], ToyEnvironment] = ToyEnvironment) -> Worlds:
-    return Worlds([Stage(make()) for _ in range(lanes)])
+def worlds(lanes: int, make: Callable[[], ToyEnvironment] = ToyEnvironment) -> list[Stage]:
+    return [Stage(make()) for _ in range(lanes)]
 
 
 @pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())

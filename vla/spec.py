@@ -251,6 +251,10 @@ class Shape:
     faces: Array | None = None  # (F, 3) int32, meshes only
 
 
+def _no_rows() -> Array:
+    return np.empty((0, 0), np.float32)
+
+
 @dataclass
 class Episode:
     """Finished rollout of N steps."""
@@ -259,11 +263,11 @@ class Episode:
     task: str  # as in `Environment`
     instruction: str  # the first one
     outcome: str  # "success" or the name of the failure
-    milestones: frozenset[str]  # as in `Environment`
-    draws: dict[str, Any]  # randomisation axis → drawn values, JSON-able
-    observations: list[Observation]  # N, each one before the action of the same index
-    actions: Array  # (N, D) float32, labels for imitation
-    executed: Array  # (N, D) float32, as sent to the robot; differs if the expert is perturbed or only labels
+    milestones: frozenset[str] = frozenset()  # as in `Environment`
+    draws: dict[str, Any] = field(default_factory=dict)  # randomisation axis → drawn values, JSON-able
+    observations: list[Observation] = field(default_factory=list)  # N, each one before the action of the same index
+    actions: Array = field(default_factory=_no_rows)  # (N, D) float32, labels for imitation
+    executed: Array = field(default_factory=_no_rows)  # (N, D) float32, as sent to the robot, perhaps perturbed
     completed: tuple[int, int] | None = None  # instructions completed, of how many; None if there is only one
     tool: Array | None = None  # (N + 1, 3) its positions [m], the last one at the end; None if the world has none
 

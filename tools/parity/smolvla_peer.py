@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from copy import deepcopy
 from types import SimpleNamespace
+from typing import Any
 
 import lerobot_modules  # first: it makes the imports of LeRobot possible  # noqa: F401
 import torch
@@ -45,7 +46,8 @@ class Peer:
     """`VLAFlowMatching.sample_actions` in place of the network; the way there and back is ours."""
 
     def __init__(self, model: VisionLanguageAction) -> None:
-        self.model, self.network = model, their_network(model.network.vlm.config, model.chunk)
+        vlm: Any = model.network.vlm
+        self.model, self.network = model, their_network(vlm.config, model.chunk)
         named = dict(self.network.named_parameters())
         with torch.no_grad():
             for name, weight in published(model.network):

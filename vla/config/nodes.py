@@ -6,7 +6,7 @@ They are light to import, because a config is checked before its job is.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -181,7 +181,7 @@ class Benchmark:
     rounds: Count  # of training, interleaved
     precisions: Annotated[list[Literal["fp32", "bf16"]], MinLen(1)]
     compile: Annotated[list[bool], MinLen(1)]
-    peer: Callable[..., Callable] | None  # makes of the model a function of its input that predicts the same actions
+    peer: dict[str, object] | None  # factory of a function of the model's input, which predicts the same actions
 
 
 def conditions(together: Mapping[str, Changes], one_by_one: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -26,7 +26,6 @@ class StoreReport:
     whole: list[Entry]  # the undamaged episodes
     damaged: dict[str, list[int]]  # kind of damage → seeds
     actions: Array  # (N, D) float32, of the undamaged episodes
-    executed: Array  # (N, D) float32
 
     @property
     def hours(self) -> float:
@@ -59,7 +58,7 @@ def verify_store(store: EpisodeStore) -> StoreReport:
     """Verify checksums, index lines and finite numbers of every episode of a store that may be damaged."""
     entries_by_config(store)  # raises an error if lines are missing
     damaged: dict[str, list[int]] = {}
-    whole, actions, executed = [], [], []
+    whole, actions = [], []
     if lost := [entry.seed for entry in store.tried if entry.outcome == LOST]:
         damaged["no readable line in the index"] = lost
     for entry in track(store.episodes, description="verifying"):
@@ -70,9 +69,8 @@ def verify_store(store: EpisodeStore) -> StoreReport:
             continue
         whole.append(entry)
         actions.append(rows["action"])
-        executed.append(rows["executed"])
     none = np.empty((0, len(store.spec.action)), np.float32)
-    return StoreReport(store, whole, damaged, np.concatenate([none, *actions]), np.concatenate([none, *executed]))
+    return StoreReport(store, whole, damaged, np.concatenate([none, *actions]))
 
 
 def require_whole(report: StoreReport) -> None:
@@ -118,15 +116,7 @@ def episode_of(store: EpisodeStore, entry: Entry) -> Episode:
 def without_rows(entry: Entry) -> Episode:
     """Return the episode of an index entry, without its rows."""
     return Episode(
-        seed=entry.seed,
-        task=entry.task,
-        instruction=entry.instruction,
-        outcome=entry.outcome,
-        milestones=frozenset(entry.milestones),
-        draws=entry.draws,
-        observations=[],
-        actions=np.empty((0, 0)),
-        executed=np.empty((0, 0)),
+        entry.seed, entry.task, entry.instruction, entry.outcome, frozenset(entry.milestones), draws=entry.draws
     )
 
 

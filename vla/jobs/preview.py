@@ -11,7 +11,8 @@ from vla.config.experiment import Experiment
 from vla.config.nodes import Preview
 from vla.io.files import writing
 from vla.io.printable import show
-from vla.reports.observations import draws_table, save_contact_sheet
+from vla.reports.observations import draws_table, reset_panels
+from vla.reports.pictures import save
 from vla.rollouts.rollout import close_agent, rollout
 
 log = logging.getLogger(__name__)
@@ -39,6 +40,6 @@ def run(experiment: Experiment) -> None:
 
             merge(recordings, output / "preview.rrd")
             written.append(output / "preview.rrd")
-    save_contact_sheet(list(seeds), first, output / "preview.png")
+    save(output / "preview.png", reset_panels(list(seeds), first), 2, (6.5, 2.2))
     show(draws_table(list(seeds), draws))
     log.info("wrote %s", " and ".join(map(str, written)))

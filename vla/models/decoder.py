@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from vla.io.types import Inherited, Layers, Rate, Width
 from vla.models.context import Encoded
 from vla.models.layers import Batch, mean_where, require_heads
-from vla.models.model import ContextModel, Prediction, log_probabilities
+from vla.models.model import ContextModel, Prediction
 from vla.models.tokenizers.tokenizer import PerComponent
 
 
@@ -123,14 +123,6 @@ class Decoder(ContextModel):
         if not isinstance(self.tokenizer, PerComponent):
             return Prediction(actions)
         return Prediction(actions, logits.unflatten(1, (self.chunk, -1)).softmax(-1))
-
-    def log_probabilities(self, batch: Batch, actions: Tensor) -> Tensor:
-        """Return the log-probabilities, (B, k), of the tokens of (B, k, D) actions, each given those before it."""
-        if not isinstance(self.tokenizer, PerComponent):
-            return super().log_probabilities(batch, actions)
-        tokens = self.tokenizer.tokenize(actions)
-        logits = self.head(self.decode(tokens[:, :-1], self.encoded(batch))).float()
-        return log_probabilities(logits, tokens).unflatten(1, (self.chunk, -1)).sum(-1)
 
     def decode(self, tokens: Tensor, context: Encoded) -> Tensor:
         """Map the first n tokens, (B, n), to the hidden states that predict the first n + 1 tokens, (B, n + 1, E)."""

@@ -159,14 +159,6 @@ class Model(nn.Module, ABC):
         Requires "present", "text", and the images and states or the "tokens" of all frames.
         """
 
-    def log_probabilities(self, batch: Batch, actions: Tensor) -> Tensor:
-        """Return the log-probabilities, (B, k), of the tokens of (B, k, D) actions after the newest frame.
-
-        Raises:
-            UserError: the model has none, because it predicts numbers, or its tokens are of no single action.
-        """
-        raise UserError(f"{type(self).__name__} with {type(self.tokenizer).__name__} gives actions no probabilities")
-
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the scalar `loss` to minimise, and its parts by name."""
         output = self(batch)
@@ -288,22 +280,8 @@ class TokenModel(Model):
 
     def predict(self, batch: Batch) -> Prediction:
         """Decode the logits of the newest frame."""
-        logits = self._newest_logits(batch)
-        return Prediction(self.tokenizer.decode_logits(logits), logits.softmax(-1))
-
-    def log_probabilities(self, batch: Batch, actions: Tensor) -> Tensor:
-        """Return the log-probabilities, (B, k), of the tokens of (B, k, D) actions after the newest frame."""
-        return log_probabilities(self._newest_logits(batch), self.tokenizer.encode(actions)).sum(-1)
-
-    def _newest_logits(self, batch: Batch) -> Tensor:
-        """Return the logits of the newest frame, (B, k, D, K) float32."""
-        frame = newest(batch["present"])
-        logits = self(batch)["logits"]
+        frame, logits = newest(batch["present"]), self(batch)["logits"]
         if logits.shape[1] != batch["present"].shape[1]:
             raise UserError(f"{type(self).__name__}.forward must return logits for every frame of its history")
-        return logits[torch.arange(len(frame)), frame].float()
-
-
-def log_probabilities(logits: Tensor, tokens: Tensor) -> Tensor:
-    """Return the log-probabilities of tokens (…) under logits (…, K)."""
-    return logits.log_softmax(-1).gather(-1, tokens.unsqueeze(-1)).squeeze(-1)
+        logits = logits[torch.arange(len(frame)), frame].float()  # (B, k, D, K)
+        return Prediction(self.tokenizer.decode_logits(logits), logits.softmax(-1))

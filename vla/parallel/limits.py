@@ -28,14 +28,10 @@ def cores() -> int:
 
 def processor() -> str:
     """Return the name of the processor."""
-    return processor_facts().get("model name") or platform.processor() or platform.machine()
-
-
-def processor_facts() -> dict[str, str]:
-    """Return what Linux tells about the processor, such as its `flags`; empty elsewhere."""
     file = Path("/proc/cpuinfo")
     lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
-    return {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    facts = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    return facts.get("model name") or platform.processor() or platform.machine()
 
 
 def free_memory() -> float:

@@ -20,11 +20,6 @@ from vla.spec import Array, Observation, Spec
 SHOWN = 6  # windows of the first training batch
 
 
-def save_contact_sheet(seeds: Sequence[int], observations: Sequence[Observation], path: Path) -> None:
-    """Draw the first observations of several episodes into a PNG file, written atomically."""
-    save(path, reset_panels(seeds, observations), 2, (6.5, 2.2))
-
-
 def reset_panels(seeds: Sequence[int], observations: Sequence[Observation]) -> Panels:
     """Return a panel per episode: the colour image of every camera, then its depth image, from near (blue) to far (red)
     in one range for all episodes, and without returns black."""

@@ -87,7 +87,8 @@ def _kinematics(model: RobotModel, limits: tuple[Array, Array, Array] | None) ->
 def _joint_controller(spec: Spec, model: RobotModel, workspace: tuple[Point, Point] | None) -> JointController:
     if others := [name for name in spec.action if name not in (*model.joints, GRIPPER)]:
         raise UserError(f"the policy's action has {', '.join(others)}, which are no joints of its robot")
-    joint_factors(spec)  # those of the state must be known too
+    # The units of the state must be known too.
+    _factors(model.joints, dict(zip(spec.state, spec.state_units, strict=True)))
     if workspace is not None:
         raise UserError(
             "deploy.safety.workspace cannot be kept by a policy that acts with joint positions: set it to null, and "
@@ -119,14 +120,6 @@ def gripper_index(spec: Spec) -> int | None:
     """Return the index of the gripper's opening in an action; None if there is none or it is a joint of the arm."""
     joints = spec.require_robot("deployment").joints
     return spec.action.index(GRIPPER) if GRIPPER in spec.action and GRIPPER not in joints else None
-
-
-def joint_factors(spec: Spec, velocities: bool = False) -> Array:
-    """Return the (J,) factors from the units of the joints in the state to [rad], or of their velocities to [rad/s]
-    (UserError: there is no robot, or a joint has another unit)."""
-    robot = spec.require_robot("a position in rad")
-    units = {name: unit.removesuffix("/s") for name, unit in zip(spec.state, spec.state_units, strict=True)}
-    return _factors(robot.velocities if velocities else robot.joints, units)
 
 
 def _factors(joints: Iterable[str], units: dict[str, str]) -> Array:

@@ -15,7 +15,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vla.data.episodes import EpisodeStore
@@ -128,18 +127,7 @@ class _Attempts:
         seed, future = self._pending.popleft()
         task = self._task_of(seed)
         if not _needed(task, self._solved):
-            none = np.empty((0, 0), np.float32)
-            return Episode(
-                seed=seed,
-                task=task,
-                instruction="",
-                outcome=NOT_NEEDED,
-                milestones=frozenset(),
-                draws={},
-                observations=[],
-                actions=none,
-                executed=none,
-            )
+            return Episode(seed, task, "", NOT_NEEDED)
         episode: Episode = (future or self._pool.submit(seed)).result()
         self._solved[task] += episode.success
         return episode

@@ -21,7 +21,7 @@ from vla.rollouts.motion import motion_of
 from vla.rollouts.recordings import Recordings, chosen
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, close_agent
-from vla.rollouts.worlds import Stage, Worlds, in_lanes, play
+from vla.rollouts.worlds import Stage, in_lanes, play
 from vla.spec import FIRST_SEED, Agent, Agents, Environment, Episode, Recorder
 
 log = logging.getLogger(__name__)
@@ -153,7 +153,7 @@ def _record(pool: Pool, results: Sequence[Result]) -> None:
 
 def play_episode(environment: Environment, agent: Agent, seed: int) -> Result:
     """Play one episode; errors become results, so that one seed ends neither an evaluation nor a training."""
-    ((_, ended),) = play(Worlds([Stage(environment)]), in_lanes(agent), [seed], all_images=False)
+    ((_, ended),) = play([Stage(environment)], in_lanes(agent), [seed], all_images=False)
     return result_of(seed, ended, environment.spec.control_hz)
 
 
@@ -213,13 +213,13 @@ class _RolloutWorker:
         others = range(1, lanes if isinstance(self._agent, Agents) else 1)
         self._environments = [first, *(make_environment() for _ in others)]
         recorders = [None if make_recorder is None else _LenientRecorder(make_recorder()) for _ in self._environments]
-        self._worlds = Worlds([Stage(*each) for each in zip(self._environments, recorders, strict=True)])
+        self._stages = [Stage(*each) for each in zip(self._environments, recorders, strict=True)]
 
     def attempt(self, item: tuple[Sequence[int], bool]) -> list[Result]:
         """Play the episodes of seeds, and record them if the second part of the item says so."""
         seeds, recorded = item
-        played = play(self._worlds, in_lanes(self._agent), seeds, recorded, recorded)
-        return [result_of(seed, ended, self._worlds.spec.control_hz) for seed, ended in played]
+        played = play(self._stages, in_lanes(self._agent), seeds, recorded, recorded)
+        return [result_of(seed, ended, self._environments[0].spec.control_hz) for seed, ended in played]
 
     def close(self) -> None:
         """Close the environments and the agent."""

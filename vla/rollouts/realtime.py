@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -50,16 +50,6 @@ class Network:
 IDEAL = Network(latency=0.0, jitter=0.0, loss=0.0, ensemble=None)
 
 
-class Answer(Protocol):
-    """A chunk that is under way, as a `concurrent.futures.Future`."""
-
-    def done(self) -> bool:
-        """Return whether it has arrived, or never will."""
-
-    def result(self) -> Array | None:
-        """Wait for the chunk (k, D), and return it, or None if it was lost; raises what the policy raised."""
-
-
 class RealTime:
     """Acts at every step with the newest chunk that has arrived, and holds where there is none.
 
@@ -87,7 +77,7 @@ class RealTime:
         """Start an episode, once the policy is idle."""
         self._link.reset(seed)
         self._schedule, self._step, self._observed = Schedule[Array](), 0, 0
-        self._answer: Answer | None = None
+        self._answer: Delayed | Future[Array] | None = None
         self._last: Array | None = None
 
     def act(self, observation: Observation) -> Array:
@@ -165,11 +155,11 @@ class Delayed:
     actions: Array | None  # None: lost
 
     def done(self) -> bool:
-        """See `Answer`."""
+        """Return whether it has arrived, or never will."""
         return self.link.now >= self.due
 
     def result(self) -> Array | None:
-        """See `Answer`."""
+        """Return the chunk (k, D), or None if it was lost."""
         return self.actions
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import subprocess
 from collections import Counter
@@ -14,8 +13,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 import rerun_cli
-from PIL import Image
 
+from vla.data.image_codec import encode
 from vla.io.errors import UserError
 from vla.io.files import atomic_path
 from vla.io.types import Natural, Point
@@ -132,7 +131,7 @@ class _Writer:
         """Write colour as JPEG; depth [mm] as it is, which Rerun compresses faster and better than PNG would."""
         steps = np.arange(len(observations))
         for camera in observations[0].rgb:
-            blobs = [encoded(seen.rgb[camera], "JPEG", quality=90) for seen in observations]
+            blobs = [encode(seen.rgb[camera], "jpeg", quality=90) for seen in observations]
             columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
             self._columns(_path("camera", camera, "rgb"), steps, columns)
         for camera in observations[0].depth:
@@ -221,13 +220,6 @@ def _path(*parts: str) -> str:
 
 def _xyzw(wxyz: Array) -> Any:
     return np.asarray(wxyz)[..., [1, 2, 3, 0]]
-
-
-def encoded(pixels: Array, kind: str, **options: int) -> bytes:
-    """Encode an image file of `kind`, "PNG" or "JPEG", with Pillow's `options`."""
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, kind, **options)
-    return buffer.getvalue()
 
 
 def _solid(shape: Shape) -> Any:

@@ -95,7 +95,7 @@ class RemotePolicy:
         if self.actions is not None and sorted(self.actions) != sorted(self.spec.action):
             raise UserError(f"agent.actions must map {', '.join(self.spec.action)}, got {', '.join(self.actions)}")
         self.info: dict[str, Any] = {}
-        self._broken, self._configured_execute = False, self.execute
+        self._broken, self._warned, self._configured_execute = False, False, self.execute
         self._low, self._high = np.array(self.spec.low, np.float32), np.array(self.spec.high, np.float32)
         with ExitStack() as opened:
             self._connection = opened.enter_context(closing(Connection(self.url, self.timeout, self.api_key)))
@@ -202,7 +202,12 @@ class RemotePolicy:
         mine = np.stack([each.scale * actions[:, each.index] + each.offset for each in columns], 1)
         if not np.isfinite(mine).all():
             raise self._connection.error("an action is not finite")
-        return np.clip(mine.astype(np.float32), self._low, self._high)
+        clipped = np.clip(mine.astype(np.float32), self._low, self._high)
+        if not self._warned and (np.abs(mine - clipped) > self._high - self._low).any():
+            self._warned = True
+            where = f"actions of {self.url} are far beyond the bounds of the world"
+            log.warning("%s, to which they are clipped: set agent.actions to its units", where)
+        return clipped
 
 
 class Connection:

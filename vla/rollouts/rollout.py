@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla.rollouts.worlds import Stage, Worlds, copied, in_lanes, play
+from vla.rollouts.worlds import Stage, copied, in_lanes, play
 from vla.spec import Agent, Environment, Episode, Observation, Recorder
 
 EnvironmentFactory = Callable[[], Environment]
@@ -22,8 +22,8 @@ def rollout(
     There is a UserError if the agent returned an action of the wrong shape, or one that is not finite, or the episode
     is over at its start.
     """
-    worlds = Worlds([Stage(environment, recorder)])
-    ((_, ended),) = play(worlds, in_lanes(agent), [seed], recorder is not None, all_images)
+    stage = Stage(environment, recorder)
+    ((_, ended),) = play([stage], in_lanes(agent), [seed], recorder is not None, all_images)
     if isinstance(ended, Exception):
         raise ended
     return ended

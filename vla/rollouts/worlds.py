@@ -77,33 +77,6 @@ class Stage:
         return episode
 
 
-class Worlds:
-    """Stages side by side, each in a lane; what is asked of one lane does not wait for the others."""
-
-    def __init__(self, stages: Sequence[Stage]) -> None:
-        self._stages, self.lanes, self.spec = stages, len(stages), stages[0].environment.spec
-        self._answers: list[tuple[int, Any]] = []
-
-    def reset(self, lane: int, seed: int, recorded: bool) -> None:
-        """Start the episode of a seed in a lane."""
-        self._ask(lane, self._stages[lane].reset, seed, recorded)
-
-    def step(self, lane: int, action: Array, info: Mapping[str, Any], blind: bool) -> None:
-        """Apply an action (D,), about which `info` is known; the next observation has no images if it is `blind`."""
-        self._ask(lane, self._stages[lane].step, action, info, blind)
-
-    def _ask(self, lane: int, call: Callable[..., Any], *arguments: Any) -> None:
-        try:
-            self._answers.append((lane, call(*arguments)))
-        except Exception as error:  # of any kind: worlds are what people write
-            self._answers.append((lane, error))
-
-    def wait(self) -> list[tuple[int, Any]]:
-        """Return the answers of the lanes that were asked: the next observation, the ended episode, or an error."""
-        answers, self._answers = self._answers, []
-        return answers
-
-
 class _Alone:
     """An agent of one world in a single lane."""
 
@@ -146,9 +119,9 @@ class _Episode:
 
 
 def play(
-    worlds: Worlds, agents: Agents, seeds: Sequence[int], recorded: bool = False, all_images: bool = True
+    stages: Sequence[Stage], agents: Agents, seeds: Sequence[int], recorded: bool = False, all_images: bool = True
 ) -> Iterator[tuple[int, Any]]:
-    """Play the episodes of seeds side by side; yield seed → `Episode`, or its error, as they end.
+    """Play the episodes of seeds side by side, on a stage per lane; yield seed → `Episode`, or its error, as they end.
 
     Without `all_images`, images are rendered only at steps where the agent reads them. If a new instruction makes the
     agent read an image that was not rendered, the episode is run again with all images. A new instruction resets the
@@ -159,16 +132,18 @@ def play(
     rows are given by seeds, serve all lanes in one pass.
     """
     waiting, playing = list(seeds), dict[int, _Episode]()
+    answers: dict[int, Any] = {}  # of the worlds: the next observation, the ended episode, or an error
     while waiting or playing:
-        for lane in range(worlds.lanes):
+        for lane, stage in enumerate(stages):
             if waiting and lane not in playing:
-                fitting = next((seed for seed in waiting if seed % worlds.lanes == lane), waiting[0])
+                fitting = next((seed for seed in waiting if seed % len(stages) == lane), waiting[0])
                 waiting.remove(fitting)
                 playing[lane] = _Episode(fitting, everything=all_images)
-                worlds.reset(lane, fitting, recorded)
+                answers[lane] = _tried(stage.reset, fitting, recorded)
+        asked, answers = answers, {}
         seen: dict[int, Observation] = {}
         ended: dict[int, Any] = {}
-        for lane, found in worlds.wait():
+        for lane, found in asked.items():
             try:
                 if not isinstance(found, Observation):
                     ended[lane] = found
@@ -176,17 +151,24 @@ def play(
                     seen[lane] = found
                 else:
                     playing[lane] = _Episode(playing[lane].seed, everything=True)
-                    worlds.reset(lane, playing[lane].seed, recorded)
+                    answers[lane] = _tried(stages[lane].reset, playing[lane].seed, recorded)
             except Exception as error:  # of any kind: agents are what people write
                 ended[lane] = error
-        for lane, action in _acted(agents, seen, len(worlds.spec.action)).items():
+        for lane, action in _acted(agents, seen, len(stages[0].environment.spec.action)).items():
             if isinstance(action, Exception):
                 ended[lane] = action
                 continue
             playing[lane].blind = not playing[lane].everything and not agents.looking(lane)
-            worlds.step(lane, action, agents.about(lane), playing[lane].blind)
+            answers[lane] = _tried(stages[lane].step, action, agents.about(lane), playing[lane].blind)
         for lane, found in ended.items():
             yield playing.pop(lane).seed, found
+
+
+def _tried(call: Callable[..., Any], *arguments: Any) -> Any:
+    try:
+        return call(*arguments)
+    except Exception as error:  # of any kind: worlds are what people write
+        return error
 
 
 def _follows(agents: Agents, lane: int, playing: _Episode, seen: Observation) -> bool:

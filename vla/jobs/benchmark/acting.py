@@ -8,9 +8,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
-from hydra.utils import instantiate
 from torch import Tensor
 
+from vla.config.build import Group, build
 from vla.config.compose import compose
 from vla.config.experiment import Experiment, plain
 from vla.config.nodes import Benchmark
@@ -18,6 +18,7 @@ from vla.io.errors import UserError
 from vla.jobs.benchmark.measure import Measure, measure, timed
 from vla.jobs.collect import demonstrations
 
+PEER = Group("benchmark.peer", ("collections.abc.Callable",))
 EQUAL = 1e-4  # largest difference of equal actions, relative to the largest one
 
 
@@ -41,7 +42,7 @@ def policy(experiment: Experiment) -> dict[str, Measure]:
     with torch.inference_mode():
         kept = agent.window()
         if asked.peer:
-            floor = partial(instantiate(asked.peer, _convert_="all")(model), kept)
+            floor = partial(build({**asked.peer, "_partial_": False}, PEER, model=model), kept)
             _require_equal(floor(), model.predict(kept).actions)
         else:
 

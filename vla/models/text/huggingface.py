@@ -9,6 +9,7 @@ import hashlib
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,13 +23,12 @@ from vla.io.errors import UserError
 from vla.models.hub import fetch
 from vla.models.packaged import PackagedFile
 from vla.models.text.ngrams import TextEncoder
-from vla.models.text.tensor_cache import TensorCache
 
 log = logging.getLogger(__name__)
 
 WEIGHTS = "model*.safetensors"
 FILES = ("config.json", "tokenizer.json", "tokenizer_config.json", WEIGHTS, "model.safetensors.index.json")
-CACHE_BYTES = 64 << 20  # of sentence vectors; 16 000 sentences of 1024 components
+KEPT = 1 << 13  # sentence vectors, 4 kB of 1024 components each
 
 # Models that are more than an encoder of texts: class of this part, and which of its outputs is a sentence vector.
 TEXT_PARTS = {
@@ -55,7 +55,6 @@ class SentenceEncoder:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._vectors = TensorCache(CACHE_BYTES)
         try:
             self.network, self._output = _network(folder)
             self._tokenizer = _tokenizer(folder, self.network.config)
@@ -73,13 +72,19 @@ class SentenceEncoder:
 
     def embed(self, sentence: str) -> Tensor:
         """Return the trained sentence vector, or else the mean over all tokens, (E,) float32."""
-        return self._vectors.get(sentence, lambda: self._embed(sentence))
+        return _vector(self, sentence)
 
     @torch.no_grad()
-    def _embed(self, sentence: str) -> Tensor:
+    def compute(self, sentence: str) -> Tensor:
+        """Return the vector of `embed`, which is not looked up."""
         ids = torch.tensor([self._tokenizer.encode(sentence).ids or [0]])  # (1, L), also for an empty sentence
         output = self.network(input_ids=ids)
         return output.last_hidden_state[0].mean(0) if self._output is None else output[self._output][0]
+
+
+@lru_cache(KEPT)
+def _vector(encoder: SentenceEncoder, sentence: str) -> Tensor:
+    return encoder.compute(sentence)
 
 
 class HuggingFace(TextEncoder):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import zlib
 from abc import ABC, abstractmethod
+from functools import lru_cache
 from typing import Annotated
 
 import torch
@@ -16,11 +17,10 @@ from torch import Tensor, nn
 
 from vla.io.types import Rate
 from vla.models.text.colours import in_basic_terms
-from vla.models.text.tensor_cache import TensorCache
 
 PADDING = 0
 CHARACTERS = 3  # length of character n-grams
-CACHE = TensorCache(64 << 20)  # of the hashes of sentences, about 1.5 kB each
+KEPT = 1 << 13  # hashes of sentences, 1.5 kB each, ten of the longest ones
 INITIAL_STD = 0.1  # of embeddings; small, so that untrained n-grams have little effect
 PRIME, FACTOR = 2**31 - 1, 1_000_003  # of the polynomial hash of n-grams; its products fit into 64 bits
 
@@ -88,19 +88,9 @@ class NGrams(TextEncoder):
 
     def tokenize(self, sentences: list[str]) -> Tensor:
         """Return (B, L) int64 hashes, padded with 0: of n-grams, or with word dropout of words, case ignored."""
-        options = self.vocabulary, self.words, self.word_dropout is None, self.basic_colours
-        rows = [CACHE.get(each, lambda each=each: torch.tensor(self._hashes(each)), *options) for each in sentences]
+        words = None if self.word_dropout is not None else self.words
+        rows = [_hashes(each, self.vocabulary, words, self.basic_colours) for each in sentences]
         return nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=PADDING)
-
-    def _hashes(self, sentence: str) -> list[int]:
-        found = words_of(sentence)
-        if self.basic_colours:
-            found = in_basic_terms(found)
-        # crc32, because hash() differs between processes.
-        if self.word_dropout is not None:
-            return [1 + zlib.crc32(word.encode()) % (PRIME - 1) for word in found] or [PADDING]
-        grams = [*_word_ngrams(found, self.words), *_character_ngrams(found)]
-        return [1 + zlib.crc32(gram.encode()) % (self.vocabulary - 1) for gram in grams] or [PADDING]
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Return (B, width) vectors for (B, L) tokens; 0 is ignored at any position."""
@@ -130,6 +120,17 @@ class NGrams(TextEncoder):
 def words_of(sentence: str) -> list[str]:
     """Return the words of a sentence in lower case."""
     return re.findall(r"\w+", sentence.lower())
+
+
+@lru_cache(KEPT)
+def _hashes(sentence: str, vocabulary: int, longest: int | None, basic_colours: bool) -> Tensor:
+    """Return the hashes of the n-grams of up to `longest` words and of characters, or without it of the words."""
+    words = in_basic_terms(words_of(sentence)) if basic_colours else words_of(sentence)
+    # crc32, because hash() differs between processes.
+    if longest is None:
+        return torch.tensor([1 + zlib.crc32(word.encode()) % (PRIME - 1) for word in words] or [PADDING])
+    grams = [*_word_ngrams(words, longest), *_character_ngrams(words)]
+    return torch.tensor([1 + zlib.crc32(gram.encode()) % (vocabulary - 1) for gram in grams] or [PADDING])
 
 
 def _word_ngrams(words: list[str], longest: int) -> list[str]:

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vla.robots.cartesian import rotation_z
 from vla.spec import Array
 from vla.tasks.libero.places import Place
-from vla.tasks.libero.room import CLEAR, HAND, PALM, TIP, axes, clearance, far, turned
+from vla.tasks.libero.room import CLEAR, HAND, PALM, TIP, axes, clearance, far
 from vla.tasks.libero.situation import THIN, Situation
 
 WIDEST = 0.074  # of a thing between the open fingers [m]
@@ -64,7 +65,7 @@ def _costs(at: Situation, thing: str, grasps: Sequence[Grasp], place: Place) -> 
     """Return costs (K,) of how far the hand must turn, and of what hinders it where it grasps and where it lets go."""
     here = np.array([grasp.position for grasp in grasps])
     yaws, leans = np.array([grasp.yaw for grasp in grasps]), np.array([grasp.lean for grasp in grasps])
-    there = place.spot + (here - at.origin(thing)) @ turned(place.turn).T
+    there = place.spot + (here - at.origin(thing)) @ rotation_z(place.turn).T
     turns = np.array([at.turn_to(yaw) for yaw in yaws])
     # What is near the hand costs less: the choice stays the same while the hand approaches.
     near = np.minimum(np.linalg.norm(here[:, :2] - at.hand[:2], axis=1), HAND)

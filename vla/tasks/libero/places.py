@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vla.robots.cartesian import rotation_z
 from vla.spec import Array
-from vla.tasks.libero.room import CLEAR, clearance, far, turned
+from vla.tasks.libero.room import CLEAR, clearance, far
 from vla.tasks.libero.situation import Situation
 
 LOOSE = 0.02  # distance from a spot at which a thing may be lowered where there is room [m]
@@ -95,7 +96,7 @@ def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
         form = _Form(points, origin, turn)
         gaps, roofs = form.room(spots, rest)
         costs = away + 2 * np.maximum(0, MARGIN - gaps) + ROOFED * roofs
-        hands = spots + turned(turn) @ (at.hand - origin)  # where the hand is then, if it holds the thing
+        hands = spots + rotation_z(turn) @ (at.hand - origin)  # where the hand is then, if it holds the thing
         if held:
             costs += STAY * np.minimum(np.linalg.norm(spots[:, :2] - origin[:2], axis=1), REACHED)
             costs += _hindrance(hands, at.yaw + turn, rest) + far(at, hands)
@@ -148,7 +149,7 @@ class _Form:
         inside = (points[:, :2] - origin[:2]) @ directions
         low, high = inside.min(axis=0), inside.max(axis=0)
         self._half, self._height = (high - low) / 2, points[:, 2].max() - origin[2]
-        self._axes = turned(turn)[:2, :2] @ directions
+        self._axes = rotation_z(turn)[:2, :2] @ directions
         self._middle = self._axes @ (high + low) / 2
 
     def _gaps(self, spots: Array, rest: Array) -> Array:

@@ -41,12 +41,6 @@ def far(at: Situation, spots: Array) -> Array:
     return 3 * np.maximum(0, np.maximum(distance - ARM[1], ARM[0] - distance))
 
 
-def turned(angle: float) -> Array:
-    """Return the matrix (3, 3) of a rotation about the vertical [rad]."""
-    sine, cosine = np.sin(angle), np.cos(angle)
-    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-
-
 def axes(yaw: float) -> tuple[Array, Array]:
     """Return the horizontal directions (2,) in which the fingers close, and across it."""
     return np.array([-np.sin(yaw), np.cos(yaw)]), np.array([np.cos(yaw), np.sin(yaw)])
