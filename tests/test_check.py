@@ -304,7 +304,7 @@ KEPT = [
 
 @pytest.mark.parametrize("override", KEPT)
 def test_a_checkpoint_keeps_its_tokenizer_and_model(override: str, checkpoint: Path) -> None:
-    with pytest.raises(ValueError, match="cannot be combined with a checkpoint"):
+    with pytest.raises(ValueError, match="cannot be combined with saved weights"):
         adopt(config(job="evaluate", checkpoint=str(checkpoint)), [override])
 
 

@@ -105,7 +105,7 @@ def test_state_entries_with_one_name_are_told_apart_by_their_paths() -> None:
         ({"id": "toy/None-v0"}, "task.id=toy/None-v0 is not registered by toy_gym"),
         ({"id": "toy_gym:toy/Toy-v0"}, "is no environment of task.package=toy_gym"),
         ({"id": "toy/Elsewhere-v0"}, "is no environment of task.package=toy_gym"),
-        ({"package": "not_there"}, "task.package=not_there cannot be imported"),
+        ({"package": "not_there"}, "task.package=not_there cannot be imported, install it"),
         (
             {"state": {"observation.pose": None}},
             "there is no observation.pose in what the environment returns: instead",

@@ -94,6 +94,7 @@ def test_libero_pro_is_an_evaluation_with_a_paired_difference_per_change(tmp_pat
     here(tmp_path, *ONE, *QUIET, *CLEAN, *asked, "~evaluate.conditions.objects", "~evaluate.conditions.tasks")
     report = json.loads((tmp_path / "pro/report.json").read_text())
     assert [report["conditions"][name]["success"] for name in ("positions", "sentences")] == [1.0, 1.0]
+    assert {suite: part["of"] for suite, part in report["tiers"].items()} == {"object": 1}
 
 
 def test_memory_is_measured_on_libero(tmp_path: Path) -> None:

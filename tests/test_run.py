@@ -412,7 +412,7 @@ def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path
         assert gathered or torch.allclose(after.state[name], weight, atol=1e-9), name
     for other in ("model=rt1_tiny", "tokenizer.bins=64", "model.shift=[0,0]"):
         refused = here(home, *arguments, other, ok=False)
-        assert f"error: {other} cannot be combined with a checkpoint" in refused.stderr
+        assert f"error: {other} cannot be combined with saved weights" in refused.stderr
     refused = here(home, *arguments, "checkpoint=tuned", ok=False)
     assert "initialises a new training" in refused.stderr and refused.stderr.count("\n") == 1
     shutil.rmtree(tmp_path / "theirs")  # which going on does not need

@@ -256,6 +256,8 @@ def test_images_of_other_sizes_kinds_and_places_are_taken() -> None:
     np.testing.assert_array_equal(other.state, plain.state)
     large = {**message(observation), "observation/image": image.repeat(4, 0).repeat(6, 1)}
     assert KEYS.observation(large, SPEC).rgb["eye"].shape == (64, 96, 3)
+    named = replace(KEYS, images={}).observation({**message(observation), "eye": image}, SPEC)  # without a key
+    np.testing.assert_array_equal(named.rgb["eye"], image)
     parts = Keys(KEYS.images, ["east", "north"], "prompt")
     split = {"observation/image": image, "east": np.float32(1), "north": [2.0], "prompt": "go"}
     np.testing.assert_array_equal(parts.observation(split, SPEC).state, [1, 2])
@@ -402,8 +404,6 @@ def test_what_cannot_be_served_is_said_in_a_sentence() -> None:
             ValueError, match=rf"cannot listen at deploy\.host=127\.0\.0\.1 deploy\.port={port}: .*in use"
         ):
             settings(policy, port=port).run()
-    with pytest.raises(ValueError, match=r"add \+deploy\.keys\.images\.eye=KEY"):
-        settings(policy, keys=replace(KEYS, images={})).run()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -36,6 +36,7 @@ from vla.parallel.processes import ease_garbage_collection, spin_briefly, withou
 
 SWEEP = "in the sweep "  # prefix of a note on a cell's error
 PICKLE = "--experimental-rerun"  # option of Hydra
+OPTIONS = (PICKLE, "--cfg", "--config-dir", "--config-name", "--config-path", "--info", "--package")  # with values
 # Errors of a command line, a file or a machine.
 MENDABLE = (UserError, OSError, HydraException, OmegaConfBaseException, YAMLError, RecursionError)
 TRACEBACKS = "VLA_TRACEBACKS"  # environment variable that passes the user's HYDRA_FULL_ERROR to child processes
@@ -59,7 +60,11 @@ def _described(error: Exception) -> str:
     if isinstance(error, ConfigCompositionException):
         if "No match in the defaults list" in text:  # such as task/goal of another task
             group = re.split(r"Could not \w+ '", text)[-1].partition("'")[0]
-            return f"no option chosen has the group '{group}': +{group}=OPTION adds it; --help lists them"
+            adds = f"+{group}=OPTION adds it, if the chosen {group.rpartition('/')[0]} takes one"
+            return f"no option chosen has the group '{group}': {adds}; --help lists them"
+        if text.startswith("Multiple values for "):
+            group = text.removeprefix("Multiple values for ").partition(". ")[0]
+            return f"{group} has an option already, which {group}=OPTION replaces: leave out the +, or name it once"
         if isinstance(error.__cause__, OmegaConfBaseException) and error.__cause__.full_key:
             return _unknown_key(error.__cause__)
     if isinstance(error, OmegaConfBaseException) and error.full_key:
@@ -211,8 +216,14 @@ def _compose(cfg: DictConfig) -> float | None:
         _end(error)
 
 
-def _require_no_pickle(arguments: list[str]) -> None:
-    """Refuse Hydra's option that takes a config from a pickle, which may run anything; it can be abbreviated."""
+def _require_plain(arguments: list[str]) -> None:
+    """Refuse what Hydra's parser would answer with its usage, or a traceback, and its option that takes a config from a
+    pickle, which may run anything; options can be abbreviated."""
+    if {"-m", "--multirun"} & {*arguments} and any(each.startswith(("-c", "--cfg")) for each in arguments):
+        raise UserError("--cfg shows the config of one run: leave out -m, and give every key one value")
+    for name, _, value in (each.partition("=") for each in arguments if "=" in each):
+        if name.startswith("--") and not any(option.startswith(name) for option in OPTIONS):
+            raise UserError(f"{name} is no option: write {name.strip('-')}={value}, without dashes")
     if any(len(name := each.partition("=")[0]) > 2 and PICKLE.startswith(name) for each in arguments):
         raise UserError(f"{PICKLE} runs whatever a file says: compose the run again from its command line")
 
@@ -226,7 +237,7 @@ def main() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself
     sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])
     try:
-        _require_no_pickle(sys.argv[1:])
+        _require_plain(sys.argv[1:])
         offer_options()
         offer_axes()
         _compose()

@@ -171,8 +171,8 @@ def _parsed(overrides: Sequence[str], fixed: Sequence[str]) -> list[Override]:
         group = _path(override).partition(".")[0]
         if group in fixed:
             raise UserError(
-                f"{override.input_line} cannot be combined with a checkpoint, whose weights belong to the {group} "
-                "they were trained with: omit one of the two; options of task and evaluate can be combined"
+                f"{override.input_line} cannot be combined with saved weights, which belong to the {group} they were "
+                "trained with: omit one of the two; other groups, such as task, can be combined"
             )
     return parsed
 

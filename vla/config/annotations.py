@@ -133,7 +133,10 @@ def mismatch(key: str, value: Any, annotation: Any) -> str:
     words = [re.sub(r"^\w+ should (be )?| after validation.*", "", each).replace("None", "null") for each in reasons]
     choices = [str(choice) for choice in get_args(annotation)] if get_origin(annotation) is Literal else []
     verb = "must" if words[0].startswith("have ") else "must be"
-    return f"{key}{place} {verb} {' or '.join(words)}, got {short(part)}{suggestion(str(part), choices)}"
+    asked, option = f"{key}{place} {verb} {' or '.join(words)}, got {short(part)}", isinstance(part, str)
+    if option and any(each["type"] == "node" for each in found):
+        return f"{asked}: an option is chosen with a slash, {f'{key}{place}'.replace('.', '/')}={part}"
+    return f"{asked}{suggestion(str(part), choices)}"
 
 
 def _within(value: Any, location: Sequence[int | str]) -> tuple[str, Any]:

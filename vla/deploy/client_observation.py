@@ -20,23 +20,29 @@ LARGEST_IMAGE = 4096  # pixels in a row or column
 class Keys:
     """Keys of a client's observation; a key that is absent is also looked up as a path of nested maps."""
 
-    images: dict[str, Text]  # camera → image; "picture" is the whole one of which cameras show parts
+    images: dict[
+        str, Text
+    ]  # camera → image, others have their name; "picture" is the whole one of which some show parts
     state: Annotated[list[Text], MinLen(1)]  # vectors to concatenate
     prompt: Text  # instruction
+
+    def cameras(self, spec: Spec) -> dict[str, str]:
+        """Return the cameras whose images are to be sent, with their keys."""
+        return {camera: self.images.get(camera, camera) for camera in spec.given(self.images)}
 
     def observation(self, message: Any, spec: Spec) -> Observation:
         """Convert a client's observation, whose images may have any size; a UserError if it does not match the spec."""
         if not isinstance(message, Mapping):
             raise UserError(f"an observation is a map, not {type(message).__name__}")
-        cameras = spec.given(self.images)
-        wanted = [*(self.images[camera] for camera in cameras), *self.state, self.prompt]
+        cameras = self.cameras(spec)
+        wanted = [*cameras.values(), *self.state, self.prompt]
         found = {key: _find(message, key) for key in wanted}
         if missing := [key for key, value in found.items() if value is None]:
             present = ", ".join(str(key)[:50] for key in list(message)[:20])
             raise UserError(f"the observation lacks {', '.join(missing)}: it has {present or 'nothing'}")
-        images = {camera: _image(self.images[camera], found[self.images[camera]]) for camera in cameras}
+        images = {camera: _image(key, found[key]) for camera, key in cameras.items()}
         for camera, image in images.items():
-            spec.require_cut(camera, image.shape, self.images[camera])
+            spec.require_cut(camera, image.shape, cameras[camera])
         state = np.concatenate([_vector(key, found[key]) for key in self.state])
         if len(state) != len(spec.state):
             raise UserError(

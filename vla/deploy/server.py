@@ -88,8 +88,6 @@ class PolicyServer:
             raise UserError(
                 f"deploy=server serves a trained policy, checkpoint=RUN; a {type(policy).__name__} cannot be served"
             )
-        if keyless := [camera for camera in policy.spec.given(self.keys.images) if camera not in self.keys.images]:
-            raise UserError(f"the policy sees {', '.join(keyless)}: add +deploy.keys.images.{keyless[0]}=KEY")
         stop = Event()
         before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
@@ -232,7 +230,7 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
     return {
         "server": "vla",
         "policy": type(policy.model).__name__,
-        "images": {keys.images[camera]: [*spec.image_size, 3] for camera in spec.given(keys.images)},
+        "images": {key: [*spec.image_size, 3] for key in keys.cameras(spec).values()},
         "state": {"keys": keys.state, "names": list(spec.state), "units": list(spec.state_units)},
         "prompt": keys.prompt,
         "action": {"names": list(spec.action), "units": list(spec.units), **bounds},

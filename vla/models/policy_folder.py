@@ -154,7 +154,10 @@ def policy_folder(name: str | Path) -> Path:
 def _fetched(name: str) -> Path:
     """Return the folder of a policy on the hub, downloading what is not cached: a revision is looked up once."""
     if (found := REPOSITORY.fullmatch(name)) is None:
-        raise UserError(f"{name} is no policy on the hub: write {HUB}OWNER/NAME@REVISION, a tag, a branch or a commit")
+        raise UserError(
+            f"{name} is no policy on the hub: write {HUB}OWNER/NAME@REVISION, a tag, a branch or a commit; one of "
+            f"LeRobot is fine-tuned by job=train model=smolvla pretrained={name}"
+        )
     try:
         return fetch(found[1], CONFIG, SPEC, WEIGHTS, TRAINING, CARD, revision=found[2])
     except OSError as error:

@@ -155,7 +155,7 @@ def _make(package: str, id: str, options: Mapping[str, object], steps: int | Non
     try:
         import_module(package)
     except ImportError as error:
-        raise UserError(f"task.package={package} cannot be imported: {error}") from error
+        raise UserError(f"task.package={package} cannot be imported, install it by pip: {error}") from error
     try:
         spec = gymnasium.spec(id) if ":" not in id else None
     except Error as error:

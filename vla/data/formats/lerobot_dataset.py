@@ -282,7 +282,10 @@ class LeRobotDataset:
 def _read_info(folder: Path) -> layout.Info:
     path = folder / "meta/info.json"
     if not path.exists():
-        raise UserError(f"there is no LeRobot dataset in {folder} (no meta/info.json)")
+        raise UserError(
+            f"there is no LeRobot dataset in {folder} (no meta/info.json); one of the hub is downloaded by: "
+            "hf download --repo-type dataset OWNER/NAME --local-dir FOLDER"
+        )
     try:
         version = str(read_json(path, dict[str, Any]).get("codebase_version"))
     except UserError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import mujoco
@@ -55,6 +56,7 @@ class Libero(World):
         starts: Literal["by_seed", "official", "drawn"],
         steps: Literal["lerobot", "openpi"],
         settle: Natural,
+        tiers: Mapping[str, Names],
     ) -> None:
         """Find the files; scenes are compiled when first played.
 
@@ -71,6 +73,7 @@ class Libero(World):
                 official ones for the seeds of evaluations, drawn ones for all others.
             steps: whose limits of an episode's steps.
             settle: steps before the first observation, in which things come to rest.
+            tiers: suite → tasks, for reports.
 
         Raises:
             UserError: the wheels are missing, or there is no such suite.

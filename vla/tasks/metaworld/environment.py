@@ -10,6 +10,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Predicate
 
 from vla.io.errors import UserError
+from vla.io.suggestion import suggestion
 from vla.io.types import ImageSize, Names, Natural, Share, Text
 from vla.parallel.limits import free_memory
 from vla.spec import Array, Observation, Spec
@@ -84,7 +85,8 @@ class MetaWorld(World):
         self.tasks = tuple(tasks_of(tasks) if isinstance(tasks, str) else tasks)
         listed = {*self.tasks, *sentences, *(name for names in tiers.values() for name in names)}
         if unknown := sorted(listed - {*known}):
-            raise UserError(f"Meta-World has no task {', '.join(unknown)}: it has {', '.join(sorted(known))}")
+            among = suggestion(unknown[0], known) or f": it has {', '.join(sorted(known))}"
+            raise UserError(f"Meta-World has no task {', '.join(unknown)}{among}")
         if silent := [name for name in self.tasks if name not in sentences]:
             raise UserError(f"task.sentences has none for {', '.join(silent)}")
         self.spec = Spec(
