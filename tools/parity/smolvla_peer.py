@@ -1,7 +1,9 @@
 """LeRobot's SmolVLA as the floor of a plan of ours, with equal weights, images, noise and number of threads.
 
-PYTHONPATH=FOLDER_OF_LEROBOT:tools/parity:tests:. python -m vla.run job=benchmark benchmark.names=[policy] \
-  +benchmark.peer._target_=smolvla_peer.Peer +benchmark.peer._partial_=true model=smolvla model/text=utf8
+    make .venv/parity/lerobot-0.4.4
+    OMP_NUM_THREADS=1 PYTHONPATH=.venv/parity/lerobot-0.4.4:tools/parity:tests:. python -m vla.run job=benchmark \\
+      benchmark.names=[policy] +benchmark.peer._target_=smolvla_peer.Peer +benchmark.peer._partial_=true \\
+      trust=[smolvla_peer] model=smolvla model/text=utf8
 """
 
 from __future__ import annotations
