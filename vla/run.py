@@ -219,7 +219,7 @@ def _compose(cfg: DictConfig) -> float | None:
 def _require_plain(arguments: list[str]) -> None:
     """Refuse what Hydra's parser would answer with its usage, or a traceback, and its option that takes a config from a
     pickle, which may run anything; options can be abbreviated."""
-    if {"-m", "--multirun"} & {*arguments} and any(each.startswith(("-c", "--cfg")) for each in arguments):
+    if {"-m", "--multirun"} & {*arguments} and any(each.partition("=")[0] in ("-c", "--cfg") for each in arguments):
         raise UserError("--cfg shows the config of one run: leave out -m, and give every key one value")
     for name, _, value in (each.partition("=") for each in arguments if "=" in each):
         if name.startswith("--") and not any(option.startswith(name) for option in OPTIONS):

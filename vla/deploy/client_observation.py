@@ -20,9 +20,7 @@ LARGEST_IMAGE = 4096  # pixels in a row or column
 class Keys:
     """Keys of a client's observation; a key that is absent is also looked up as a path of nested maps."""
 
-    images: dict[
-        str, Text
-    ]  # camera → image, others have their name; "picture" is the whole one of which some show parts
+    images: dict[str, Text]  # camera → image, by default its name; "picture": the whole one of which some show parts
     state: Annotated[list[Text], MinLen(1)]  # vectors to concatenate
     prompt: Text  # instruction
 
