@@ -267,7 +267,7 @@ class Episode:
     draws: dict[str, Any] = field(default_factory=dict)  # randomisation axis → drawn values, JSON-able
     observations: list[Observation] = field(default_factory=list)  # N, each one before the action of the same index
     actions: Array = field(default_factory=_no_rows)  # (N, D) float32, labels for imitation
-    executed: Array = field(default_factory=_no_rows)  # (N, D) float32, as sent to the robot, perhaps perturbed
+    executed: Array = field(default_factory=_no_rows)  # (N, D) float32, sent to the robot; see `Stage.step`
     completed: tuple[int, int] | None = None  # instructions completed, of how many; None if there is only one
     tool: Array | None = None  # (N + 1, 3) its positions [m], the last one at the end; None if the world has none
 

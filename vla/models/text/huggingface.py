@@ -9,7 +9,6 @@ import hashlib
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -55,6 +54,7 @@ class SentenceEncoder:
     """
 
     def __init__(self, folder: Path) -> None:
+        self._vectors: dict[str, Tensor] = {}  # those of an encoder that is gone would keep its network
         try:
             self.network, self._output = _network(folder)
             self._tokenizer = _tokenizer(folder, self.network.config)
@@ -72,19 +72,18 @@ class SentenceEncoder:
 
     def embed(self, sentence: str) -> Tensor:
         """Return the trained sentence vector, or else the mean over all tokens, (E,) float32."""
-        return _vector(self, sentence)
+        found = self._vectors.get(sentence)
+        if found is None:
+            if len(self._vectors) >= KEPT:
+                self._vectors.clear()
+            found = self._vectors[sentence] = self._embed(sentence)
+        return found
 
     @torch.no_grad()
-    def compute(self, sentence: str) -> Tensor:
-        """Return the vector of `embed`, which is not looked up."""
+    def _embed(self, sentence: str) -> Tensor:
         ids = torch.tensor([self._tokenizer.encode(sentence).ids or [0]])  # (1, L), also for an empty sentence
         output = self.network(input_ids=ids)
         return output.last_hidden_state[0].mean(0) if self._output is None else output[self._output][0]
-
-
-@lru_cache(KEPT)
-def _vector(encoder: SentenceEncoder, sentence: str) -> Tensor:
-    return encoder.compute(sentence)
 
 
 class HuggingFace(TextEncoder):
