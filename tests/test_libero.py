@@ -96,7 +96,7 @@ def test_demonstrations_never_start_where_policies_are_tested() -> None:
     starts = Starts(opened("spatial 4")[0], tasks_of("spatial")[4])
     official = np.array([starts.official(number).qpos for number in range(len(starts))])
     assert len(np.unique(official, axis=0)) == len(official) == 50
-    drawn = np.array([starts.drawn(np.random.default_rng(seed)).qpos for seed in range(20)])
+    drawn = np.array([starts.drawn(np.random.default_rng(seed), False).qpos for seed in range(20)])
     assert np.abs(drawn[:, None] - official).max(axis=2).min() > 1e-3
     with environment.blind():
         environment.reset(0)
@@ -105,6 +105,35 @@ def test_demonstrations_never_start_where_policies_are_tested() -> None:
             environment.reset(FIRST_SEED + turn)
             assert environment.draws["start"]["official"] == turn % 50
     environment.close()
+
+
+@pytest.mark.parametrize(("name", "stay"), [("goal 5", {"flat_stove_1"}), ("long 4", {"plate_1", "plate_2"})])
+def test_things_exchange_places_but_those_that_the_task_tells_by_their_places(name: str, stay: set[str]) -> None:
+    model, data, goal = opened(name)
+    starts = Starts(model, tasks_of(name.split()[0])[int(name.split()[1])])
+    names = [model.body(number).name for number in range(model.nbody)]
+    placed: dict[bool, list[Array]] = {False: [], True: []}
+    for exchanged, places in placed.items():
+        for seed in range(20):
+            set_start(model, data, starts.drawn(np.random.default_rng(seed), exchanged))
+            assert not goal.reached(data)
+            places.append(data.xpos.copy())
+    usual, others = np.array(placed[False]), np.array(placed[True])
+    far = np.linalg.norm(others - usual.mean(axis=0), axis=2).max(axis=0) > 0.1
+    moved = {name for name, moves in zip(names, far, strict=True) if moves and name.endswith(("_main", "_base"))}
+    assert len(moved) >= 3
+    assert not {name for name in moved if name.startswith(tuple(stay))}
+    assert np.linalg.norm(usual - usual.mean(axis=0), axis=2).max() < 0.1
+
+
+def test_a_coloured_start_leaves_the_official_ones_as_they_are() -> None:
+    stove, official = ["task.suite=goal", "task.tasks=[7]"], FIRST_SEED + 3
+    with closing(world(*stove)) as plain, closing(world(*stove, "task.randomize.colours=1")) as coloured:
+        usual, tinted = (np.stack([*one.reset(0).rgb.values()]).astype(int) for one in (plain, coloured))
+        assert np.ptp(usual - tinted, axis=-1).max() > 40  # another hue
+        assert coloured.draws["start"]["coloured"]
+        assert same([plain.reset(official)], [coloured.reset(official)])
+        assert not coloured.draws["start"]["coloured"]
 
 
 def test_all_suites_have_ten_tasks_and_sentences() -> None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar
 from zlib import crc32
 
 import numpy as np
 
 from vla.io.errors import UserError
+from vla.parallel.limits import free_memory
+
+FREE = 0.25  # share of the memory that scenes leave free
 
 
 class World:
@@ -37,6 +40,36 @@ class World:
             yield
         finally:
             self._blind = before
+
+
+class _Closable(Protocol):
+    def close(self) -> None: ...
+
+
+Scene = TypeVar("Scene", bound=_Closable)
+
+
+class Scenes(Generic[Scene]):
+    """The scenes of a world's tasks, made when first played; where memory is scarce, a new one replaces the newest.
+
+    Tasks take turns, so the oldest ones are needed first.
+    """
+
+    def __init__(self) -> None:
+        self._made: dict[str, Scene] = {}
+
+    def of(self, name: str, make: Callable[[], Scene]) -> Scene:
+        """Return the scene called `name`, which `make` makes if there is none."""
+        if name not in self._made:
+            if self._made and free_memory() < FREE:
+                self._made.popitem()[1].close()
+            self._made[name] = make()
+        return self._made[name]
+
+    def close(self) -> None:
+        """Free physics and GL of all."""
+        while self._made:
+            self._made.popitem()[1].close()
 
 
 class Streams:

@@ -11,15 +11,14 @@ from annotated_types import Ge, Le, MinLen, Predicate
 
 from vla.io.errors import UserError
 from vla.io.types import ImageSize, Names, Natural, unique
-from vla.parallel.limits import free_memory
 from vla.spec import FIRST_SEED, Array, Observation, Spec
 from vla.tasks.libero.controller import REACH, Controller
 from vla.tasks.libero.goal import Goal
 from vla.tasks.libero.package import ALL, Task, suites_of, tasks_of
 from vla.tasks.libero.scene import BURNER, VISIBLE, Detail, load_scene
-from vla.tasks.libero.starts import Starts, set_start
-from vla.tasks.rendering.renderer import Renderer, RendererFactory, Views
-from vla.tasks.world import World
+from vla.tasks.libero.starts import Randomize, Starts, set_start
+from vla.tasks.rendering.renderer import LazyRenderer, RendererFactory, Views
+from vla.tasks.world import Scenes, World
 
 CONTROL_HZ = 20.0
 STATE = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z", "finger_1", "finger_2")
@@ -30,7 +29,8 @@ STEPS = {
     "openpi": {"spatial": 220, "object": 280, "goal": 300, "long": 520},
 }
 WAIT = np.array([0.0] * 6 + [-1.0])  # the command while things settle: stay, and open the gripper
-FREE = 0.25  # share of the memory that scenes leave free
+TINTED = 0.5  # share of the things with another colour, in starts that have such things
+TINT = 0.2, 1.0  # range of the factors of red, green and blue
 
 Numbers = Annotated[list[Annotated[int, Ge(0), Le(9)]], MinLen(1), Predicate(unique)]
 
@@ -54,6 +54,7 @@ class Libero(World):
         mirror: bool,
         detail: Detail,
         starts: Literal["by_seed", "official", "drawn"],
+        randomize: Randomize,
         steps: Literal["lerobot", "openpi"],
         settle: Natural,
         tiers: Mapping[str, Names],
@@ -71,6 +72,7 @@ class Libero(World):
             detail: of meshes and textures.
             starts: "official": the fifty states of the benchmark; "drawn": others, from the same regions; "by_seed":
                 official ones for the seeds of evaluations, drawn ones for all others.
+            randomize: what else differs between drawn starts.
             steps: whose limits of an episode's steps.
             settle: steps before the first observation, in which things come to rest.
             tiers: suite → tasks, for reports.
@@ -84,7 +86,7 @@ class Libero(World):
         self._tasks = [tasks_of(name)[number] for name in suites for number in chosen]
         self.tasks = tuple(task.name for task in self._tasks)
         self._starts_of, self._limits, self._settle, self._mirror = starts, STEPS[steps], settle, mirror
-        self._renderer, self._detail = renderer, detail
+        self._randomize, self._renderer, self._detail = randomize, renderer, detail
         self.spec = Spec(
             cameras=tuple(cameras),
             image_size=(image_size[0], image_size[1]),
@@ -97,8 +99,7 @@ class Libero(World):
             control_hz=CONTROL_HZ,
             truth=(("object", 3), ("goal", 3)),
         )
-        self._scenes: dict[str, Scene] = {}
-        self._started: dict[str, tuple[Starts, Goal]] = {}
+        self._scenes = Scenes[Scene]()
 
     @property
     def tool(self) -> Array:
@@ -114,15 +115,21 @@ class Libero(World):
         number = seed % len(self._tasks)
         task = self._task = self._tasks[number]
         self.task, self.done, self.outcome, self._taken = task.name, False, "timeout", 0
-        scene = self._scene = self._scene_of(task)
-        starts, self._goal = self._started_of(task, scene)
+        scene = self._scene = self._scenes.of(task.scene, lambda: Scene(task, self._renderer, self.spec, self._detail))
+        starts, self._goal = scene.started(task)
         turn = (seed - FIRST_SEED) // len(self._tasks)
-        official = self._starts_of == "official" or (self._starts_of == "by_seed" and seed >= FIRST_SEED)
-        state = turn % len(starts) if official else None
-        start = starts.drawn(np.random.default_rng(seed)) if state is None else starts.official(state)
-        self.draws = {"start": {"official": -1 if state is None else state}}
+        fixed = self._starts_of == "official" or (self._starts_of == "by_seed" and seed >= FIRST_SEED)
+        state = turn % len(starts) if fixed else None
+        random, asked = np.random.default_rng(seed), self._randomize
+        exchanged, coloured = (
+            state is None and share > 0 and bool(random.random() < share) for share in (asked.places, asked.colours)
+        )
+        start = starts.drawn(random, exchanged) if state is None else starts.official(state)
+        self.draws = {
+            "start": {"official": -1 if state is None else state, "exchanged": exchanged, "coloured": coloured}
+        }
         set_start(scene.model, scene.data, start)
-        scene.changed = True
+        scene.colour(random if coloured else None)
         scene.controller.reset()
         for _ in range(self._settle):
             scene.controller.step(scene.data, WAIT)
@@ -140,22 +147,7 @@ class Libero(World):
 
     def close(self) -> None:
         """Free physics and GL."""
-        while self._scenes:
-            self._scenes.popitem()[1].close()
-
-    def _scene_of(self, task: Task) -> Scene:
-        """Return the scene of a task; where memory is scarce, replace the newest, as tasks take turns."""
-        if task.scene not in self._scenes:
-            if self._scenes and free_memory() < FREE:
-                self._scenes.popitem()[1].close()
-                self._started.clear()
-            self._scenes[task.scene] = Scene(task, self._renderer, self.spec, self._detail)
-        return self._scenes[task.scene]
-
-    def _started_of(self, task: Task, scene: Scene) -> tuple[Starts, Goal]:
-        if task.name not in self._started:
-            self._started[task.name] = Starts(scene.model, task), Goal(scene.model, task.goal)
-        return self._started[task.name]
+        self._scenes.close()
 
     def _look(self) -> Observation:
         scene = self._scene
@@ -179,7 +171,7 @@ class Libero(World):
 
 
 class Scene:
-    """Physics of a scene, its controller, and its renderer, which is made with the first picture."""
+    """Physics of a scene, its controller, its renderer, and the starts and goals of its tasks."""
 
     def __init__(self, task: Task, renderer: RendererFactory, spec: Spec, detail: Detail) -> None:
         """Args: a task in it; renderer; the world's spec; detail of the pictures.
@@ -189,6 +181,7 @@ class Scene:
         """
         self.model = model = load_scene(task.scene, _things(task), detail)
         self.data = mujoco.MjData(model)
+        self._started: dict[str, tuple[Starts, Goal]] = {}
         self.controller = Controller(model)
         known = [model.camera(number).name for number in range(model.ncam)]
         if unknown := [name for name in spec.cameras if name not in known]:
@@ -200,15 +193,29 @@ class Scene:
             for n in self._burners
         ]
         model.site_rgba[:, 3] = 0  # marks of regions, not to be seen
+        self._colours, self._materials = model.mat_rgba.copy(), _materials(model, task)
         cameras = [known.index(name) for name in spec.cameras]
-        self._view = Views(cameras, *spec.image_size, geom_groups=(VISIBLE,), site_groups=tuple(range(6)))
-        self._factory = renderer
-        self._renderer: Renderer | None = None
-        self.changed = True
+        views = Views(cameras, *spec.image_size, geom_groups=(VISIBLE,), site_groups=tuple(range(6)))
+        self._renderer = LazyRenderer(renderer, model, views)
         self.base = model.body("robot0_base").pos.copy()  # of the arm (3,) [m]
         self._hand = model.body("robot0_right_hand").id
         first = model.joint("gripper0_finger_joint1").qposadr[0]
         self._fingers = slice(first, first + 2)
+
+    def started(self, task: Task) -> tuple[Starts, Goal]:
+        """Return starts and goal of one of the tasks in this scene."""
+        if task.name not in self._started:
+            self._started[task.name] = Starts(self.model, task), Goal(self.model, task.goal)
+        return self._started[task.name]
+
+    def colour(self, random: np.random.Generator | None) -> None:
+        """Tint about half of the things; None: give all their own colours."""
+        self.model.mat_rgba[:] = self._colours
+        if random is not None:
+            for materials in self._materials:
+                if random.random() < TINTED:
+                    self.model.mat_rgba[materials, :3] *= random.uniform(*TINT, 3)
+        self._renderer.changed = True
 
     def position(self, thing: str) -> Array:
         """Return the position (3,) of a thing or region in the world [m]."""
@@ -234,21 +241,22 @@ class Scene:
         """Draw every camera's picture (cameras, H, W, 3) uint8."""
         for burner, knob in zip(self._burners, self._knobs, strict=True):
             glows = float(self.data.qpos[knob] >= 0.5)
-            self.changed |= bool(self.model.site_rgba[burner, 3] != glows)
+            self._renderer.changed |= bool(self.model.site_rgba[burner, 3] != glows)
             self.model.site_rgba[burner, 3] = glows
-        if self._renderer is None:
-            self._renderer = self._factory.open(self.model, self._view)
-        elif self.changed:
-            self._renderer.update()
-        self.changed = False
         drawn = self._renderer.render(self.data)[0]
         return drawn[:, :, ::-1] if mirror else drawn
 
     def close(self) -> None:
         """Free the renderer."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self._renderer.close()
+
+
+def _materials(model: mujoco.MjModel, task: Task) -> list[list[int]]:
+    """Return the materials of each movable thing and fixture."""
+    bodies = [f"{thing}_main" for thing in sorted(_things(task))] + [one["body"] for one in task.fixtures.values()]
+    roots = model.body_rootid[model.geom_bodyid]
+    found = [set(model.geom_matid[roots == model.body_rootid[model.body(name).id]].tolist()) for name in bodies]
+    return [sorted(materials - {-1}) for materials in found]
 
 
 def _things(task: Task) -> set[str]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from vla.io.errors import UserError
+from vla.io.types import Share
 from vla.spec import Array
 from vla.tasks.libero.controller import HOME
 from vla.tasks.libero.package import Task, initial_states
@@ -16,6 +18,19 @@ POSTURE_NOISE = 0.02  # standard deviation of the arm's joints at a start [rad],
 MARGIN = 0.005  # by which the official places exceed the ranges of their region [m]
 OVERLAP = 0.002  # largest depth of a contact between two things at a start [m]
 DRAWS = 200  # of places until no things overlap
+
+Motion = Callable[[Array], Array]  # of points (2,) of a table [m]
+
+
+@dataclass(frozen=True)
+class Randomize:
+    """What differs between drawn starts beyond what the regions of the benchmark allow.
+
+    Args of the config node `task.randomize`.
+    """
+
+    places: Share  # of the starts, in which two pairs of things exchange their places
+    colours: Share  # of the starts, in which about half of the things have another colour
 
 
 @dataclass(frozen=True)
@@ -45,6 +60,7 @@ class Starts:
         self._data = mujoco.MjData(model)
         self._usual = self._overlapping(self.official(0))  # such as drawers in their cabinet
         self._owners = {part[1]: part[2] for part in task.initial if part[0] in ("on", "in")}
+        self._exchangeable = [thing for thing in self._owners if self._may_move(thing)]
 
     def __len__(self) -> int:
         return len(self._states)
@@ -57,22 +73,40 @@ class Starts:
         }
         return Start(self._states[number].copy(), poses)
 
-    def drawn(self, random: np.random.Generator) -> Start:
+    def drawn(self, random: np.random.Generator, exchanged: bool) -> Start:
         """Draw a start: fixtures, things, openings and the arm's posture, until nothing overlaps.
 
         Things on a table are drawn in the ranges of their regions, others, and openings, within what the official
-        states span; heights and tilts are those of the official states, which are alike in them.
+        states span; heights and tilts are those of the official states, which are alike in them. `exchanged`: two pairs
+        of things, on tables, exchange their regions first, unless the sentence or the goal would no longer hold.
         """
-        start = self._draw(random)
+        start = self._draw(random, exchanged)
         for _ in range(DRAWS):
             if self._overlapping(start) <= self._usual:
                 break
-            start = self._draw(random)
+            start = self._draw(random, exchanged)
         return start
 
-    def _draw(self, random: np.random.Generator) -> Start:
-        start, model = self.official(0), self._model
-        moved = {name: self._move_fixture(name, start, random) for name in self._task.fixtures}
+    def _may_move(self, thing: str) -> bool:
+        """Whether a thing stands on a table, and neither its place nor one beside it is part of the task."""
+        kind, goal = thing.rpartition("_")[0], set(self._task.goal)
+        twins = [name for name in self._owners if name != thing and name.rpartition("_")[0] == kind]
+        for twin in twins:  # of a different role, so that the sentence tells them apart by their places
+            other = {thing: twin, twin: thing}
+            if {tuple(other.get(name, name) for name in part) for part in goal} != goal:
+                return False
+        beside = {word for part in goal for name in part if self._on_table(name) for word in name.split("_")}
+        return self._on_table(self._owners[thing]) and not beside & set(kind.split("_"))
+
+    def _on_table(self, region: str) -> bool:
+        return bool(self._task.regions.get(region, {}).get("ranges"))
+
+    def _draw(self, random: np.random.Generator, exchanged: bool) -> Start:
+        start, model, owners = self.official(0), self._model, dict(self._owners)
+        if exchanged and len(self._exchangeable) > 1:
+            for one, other in (random.choice(self._exchangeable, 2, replace=False).tolist() for _ in range(2)):
+                owners[one], owners[other] = owners[other], owners[one]
+        moved = {name: self._move_fixture(name, owners.get(name), start, random) for name in self._task.fixtures}
         start.qpos[:7] = HOME + POSTURE_NOISE * random.standard_normal(7)
         for joint in range(9, model.njnt):
             place = model.jnt_qposadr[joint]
@@ -81,10 +115,10 @@ class Starts:
                 start.qpos[place] = random.uniform(span.min(), span.max())
                 continue
             name = model.body(model.jnt_bodyid[joint]).name.removesuffix("_main")
-            start.qpos[place : place + 2] = self._place(name, place, moved, random)
+            start.qpos[place : place + 2] = self._place(owners.get(name, ""), place, moved, random)
             start.qpos[place + 3 : place + 7] = self._turn(place, random)
-        for thing, base in self._owners.items():  # a thing on another one
-            if base in self._owners and base not in self._task.fixtures:
+        for thing, base in owners.items():  # a thing on another one
+            if base in owners and base not in self._task.fixtures:
                 rows = [model.jnt_qposadr[model.joint(f"{name}_joint0").id] for name in (thing, base)]
                 start.qpos[rows[0] : rows[0] + 2] = start.qpos[rows[1] : rows[1] + 2]
         return start
@@ -101,29 +135,30 @@ class Starts:
         body = self._model.body(int(site.bodyid[0]))
         return body.pos[:2] + site.pos[:2] + half * random.uniform(-1, 1, len(middle))
 
-    def _move_fixture(self, name: str, start: Start, random: np.random.Generator) -> Array:
-        """Draw a fixture's place and yaw into `start`, and return its displacement (2,) from the official place."""
-        region = self._owners.get(name)
+    def _move_fixture(self, name: str, region: str | None, start: Start, random: np.random.Generator) -> Motion:
+        """Draw a fixture's place and yaw into `start`, and return how it differs from the official one."""
         place = None if region is None else self._region(region, random)
         if place is None:
-            return np.zeros(2)
+            return lambda point: point
         body = self._task.fixtures[name]["body"]
         position, quaternion = start.fixtures[body]
         turn = random.uniform(*sorted(np.ravel(self._task.regions[str(region)]["yaw_rotation"])[:2]))
-        if turn:
+        if turn or region != self._owners[name]:
             quaternion = np.array([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)])
+        by = _yaw(quaternion) - _yaw(start.fixtures[body][1])
+        rotation = np.array([[np.cos(by), -np.sin(by)], [np.sin(by), np.cos(by)]])
         start.fixtures[body] = np.array([*place, position[2]]), quaternion
-        return place - position[:2]
+        return lambda point: place + rotation @ (point - position[:2])
 
-    def _place(self, name: str, row: int, moved: dict[str, Array], random: np.random.Generator) -> Array:
+    def _place(self, region: str, row: int, moved: dict[str, Motion], random: np.random.Generator) -> Array:
         """Draw x and y of a thing [m]."""
-        region = self._owners.get(name, "")
         place = self._region(region, random)
         if place is not None:
             return place
         span = self._states[:, row : row + 2]
-        on = next((displacement for fixture, displacement in moved.items() if region.startswith(fixture)), np.zeros(2))
-        return random.uniform(span.min(axis=0), span.max(axis=0)) + on
+        with_fixture = next((motion for fixture, motion in moved.items() if region.startswith(fixture)), None)
+        place = random.uniform(span.min(axis=0), span.max(axis=0))
+        return place if with_fixture is None else with_fixture(place)
 
     def _turn(self, row: int, random: np.random.Generator) -> Array:
         """Draw the quaternion of a thing: as the official ones, which differ in yaw only, if at all."""
@@ -145,6 +180,11 @@ class Starts:
         contact = self._data.contact
         deep = contact.geom[: self._data.ncon][contact.dist[: self._data.ncon] < -OVERLAP]
         return {(int(one), int(other)) for one, other in np.sort(self._model.geom_bodyid[deep], axis=1)}
+
+
+def _yaw(quaternion: Array) -> float:
+    """Return the angle of a turn about the z axis [rad]."""
+    return float(2 * np.arctan2(quaternion[3], quaternion[0]))
 
 
 def set_start(model: mujoco.MjModel, data: mujoco.MjData, start: Start) -> None:

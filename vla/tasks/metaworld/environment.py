@@ -12,17 +12,15 @@ from annotated_types import Ge, Gt, Le, Predicate
 from vla.io.errors import UserError
 from vla.io.suggestion import suggestion
 from vla.io.types import ImageSize, Names, Natural, Share, Text
-from vla.parallel.limits import free_memory
 from vla.spec import Array, Observation, Spec
 from vla.tasks.metaworld.package import tasks_of
 from vla.tasks.metaworld.scene import PictureSettings, TaskScene, parts_of
 from vla.tasks.rendering.renderer import RendererFactory
-from vla.tasks.world import World
+from vla.tasks.world import Scenes, World
 
 CONTROL_HZ = 80.0  # five substeps of 2.5 ms
 REACH = 0.01  # largest displacement of the hand per step, along each axis [m]
 STATE = ("hand_x", "hand_y", "hand_z", "opening")  # the first four numbers of an observation
-FREE = 0.25  # share of the memory that scenes leave free
 MOST_STEPS = 500  # of an episode, after which Meta-World refuses to go on
 # Of the simulator's observation (39,).
 OBJECT, GOAL = slice(4, 7), slice(36, 39)
@@ -106,7 +104,7 @@ class MetaWorld(World):
         size = self.spec.image_size
         settings = PictureSettings(renderer, self.spec.cameras, size, self.spec.parts, drawn, shadows)
         self._make_scene = partial(TaskScene, settings=settings)
-        self._scenes: dict[str, TaskScene] = {}
+        self._scenes = Scenes[TaskScene]()
         self.tool: Array = np.zeros(3)
 
     def task_of(self, seed: int) -> str:
@@ -116,7 +114,7 @@ class MetaWorld(World):
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`."""
         self.task, self.done, self.outcome, self._taken = self.task_of(seed), False, "timeout", 0
-        self._scene = self._scene_of(self.task)
+        self._scene = self._scenes.of(self.task, partial(self._make_scene, self.task))
         observation = self._scene.reset(seed)
         places = {"object": observation[OBJECT], "goal": observation[GOAL]}
         self.draws = {name: {"place": place[:2].tolist(), "height": float(place[2])} for name, place in places.items()}
@@ -133,19 +131,7 @@ class MetaWorld(World):
 
     def close(self) -> None:
         """Free physics and GL."""
-        while self._scenes:
-            self._scenes.popitem()[1].close()
-
-    def _scene_of(self, task: str) -> TaskScene:
-        """Return the scene of a task; where memory is scarce, replace the newest.
-
-        A scene takes a quarter of a second and some 80 MB. Tasks take turns, so the oldest ones are needed first.
-        """
-        if task not in self._scenes:
-            if self._scenes and free_memory() < FREE:
-                self._scenes.popitem()[1].close()
-            self._scenes[task] = self._make_scene(task)
-        return self._scenes[task]
+        self._scenes.close()
 
     def _look(self, observation: Array) -> Observation:
         pictures = () if self._blind else self._scene.pictures()

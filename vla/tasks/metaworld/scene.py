@@ -12,7 +12,7 @@ from vla.io.errors import UserError
 from vla.io.parts import Part, cut
 from vla.spec import Array
 from vla.tasks.metaworld.package import simulator, stop_sliding
-from vla.tasks.rendering.renderer import Renderer, RendererFactory, Views
+from vla.tasks.rendering.renderer import LazyRenderer, RendererFactory, Views
 
 HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the optical axis, quaternion wxyz
 # LeRobot (src/lerobot/envs/metaworld.py) moves this camera, which hangs upside down, and turns its pictures.
@@ -64,8 +64,7 @@ class TaskScene:
         seen = self._places if settings.drawn is None else sorted(set(self._places))
         height, width = settings.image_size if settings.drawn is None else (settings.drawn, settings.drawn)
         self._views = Views(seen, height, width, site_groups=(0, 1, 2), aspect=1.0)
-        self._renderer: Renderer | None = None
-        self._changed = True
+        self._renderer = LazyRenderer(settings.renderer, self.model, self._views)
 
     def reset(self, seed: int) -> Array:
         """Draw object and goal, and return the observation (39,): hand, gripper, objects, the same one step before,
@@ -78,7 +77,7 @@ class TaskScene:
         mujoco.mj_kinematics(self.model, self.simulator.data)
         current = self.simulator._get_curr_obs_combined_no_goal()
         observation[CURRENT] = observation[BEFORE] = self.simulator._prev_obs = current
-        self._changed = True
+        self._renderer.changed = True
         return observation
 
     def step(self, command: Array) -> tuple[Array, bool]:
@@ -91,11 +90,6 @@ class TaskScene:
 
     def pictures(self) -> Array:
         """Draw every camera's picture (cameras, H, W, 3) uint8."""
-        if self._renderer is None:
-            self._renderer = self._settings.renderer.open(self.model, self._views)
-        elif self._changed:
-            self._renderer.update()
-        self._changed = False
         hand = self.simulator.get_endeff_pos()
         windows = np.array([part.at(hand) for part in self._parts])
         if self._settings.drawn is None:
@@ -106,9 +100,7 @@ class TaskScene:
 
     def close(self) -> None:
         """Free physics and GL."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self._renderer.close()
         self.simulator.close()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import mujoco
@@ -59,3 +60,30 @@ class RendererFactory(Protocol):
     def open(self, model: mujoco.MjModel, views: Views) -> Renderer:
         """Make a renderer of `model`."""
         ...
+
+
+class LazyRenderer:
+    """A renderer that is made with the first picture, because blind worlds need no GL."""
+
+    def __init__(self, factory: RendererFactory, model: mujoco.MjModel, views: Views) -> None:
+        """Args: what makes it; the model; what is drawn of it."""
+        self._open = partial(factory.open, model, views)
+        self._renderer: Renderer | None = None
+        self.changed = False  # whether the model has, since the last picture
+
+    def render(
+        self, data: mujoco.MjData, windows: Array | None = None, textures: Collection[int] = ()
+    ) -> tuple[Array, Array]:
+        """Draw every camera's picture, as `Renderer.render`; `textures` are the ids of those whose pixels changed."""
+        if self._renderer is None:
+            self._renderer = self._open()
+        elif self.changed:
+            self._renderer.update(textures)
+        self.changed = False
+        return self._renderer.render(data, windows)
+
+    def close(self) -> None:
+        """Free GL."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None

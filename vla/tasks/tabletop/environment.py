@@ -15,7 +15,7 @@ from vla.io.errors import UserError
 from vla.io.types import Count, ImageSize, Names, Point, Positive
 from vla.spec import FIRST_SEED, Array, Observation, Shape, Spec
 from vla.tasks.gl import require_backend
-from vla.tasks.rendering.renderer import Renderer, RendererFactory, Views
+from vla.tasks.rendering.renderer import LazyRenderer, RendererFactory, Views
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.expert import Waypoint
 from vla.tasks.tabletop.file_robot import FileRobot
@@ -103,16 +103,15 @@ class Tabletop(World):
         )
         bounds = np.array(self.spec.low), np.array(self.spec.high)
         self.simulation = Simulation(goal, randomize, scene, *bounds, time_limit)
-        self._renderer_factory = renderer
-        self._renderer: Renderer | None = None
-        self._changed = True
+        views = Views([scene.cameras[name] for name in cameras], *self.spec.image_size, geom_groups=(VISIBLE,))
+        self.renderer = LazyRenderer(renderer, scene.model, views)
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`."""
         self.simulation.reset(seed)
         if self.simulation.name == Chain.name and seed < FIRST_SEED:
             self._skip_to(int(self.simulation.streams(seed, "start").randint(len(self.simulation.requests))))
-        self._changed = True  # in the model, for the renderer
+        self.renderer.changed = True
         # Separate streams, so that a replay without images has the same joint noise.
         self._joint_noise = self.simulation.streams(seed, "joint noise")
         self._image_noise = np.random.default_rng([seed, 1])
@@ -204,29 +203,14 @@ class Tabletop(World):
 
     def close(self) -> None:
         """Free GL."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-
-    @property
-    def renderer(self) -> Renderer:
-        """The renderer, created on first use, because blind environments need no GL."""
-        if self._renderer is None:
-            compiled, (height, width) = self.simulation.compiled, self.spec.image_size
-            cameras = [compiled.cameras[name] for name in self.spec.cameras]
-            view = Views(cameras, height, width, geom_groups=(VISIBLE,))
-            self._renderer = self._renderer_factory.open(compiled.model, view)
-        return self._renderer
+        self.renderer.close()
 
     def look(self) -> Observation:
         """Return the current observation."""
         compiled, rgb, depth = self.simulation.compiled, {}, {}
         if not self._blind:
-            if self._changed:
-                self.renderer.update(compiled.stale_textures)
-                compiled.stale_textures.clear()
-                self._changed = False
-            pictures, metres = self.renderer.render(compiled.data)
+            pictures, metres = self.renderer.render(compiled.data, textures=compiled.stale_textures)
+            compiled.stale_textures.clear()
             if compiled.noise.image:
                 pictures = self._grainy(pictures)
             millimetres = np.rint(metres * np.float32(MILLIMETRES)).astype(np.uint16)
