@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 
 from vla.config.build import check_node
 from vla.config.compose import axes
+from vla.io.errors import UserError
 from vla.models.text.colours import in_basic_terms
 from vla.models.text.ngrams import NGrams
 from vla.tasks.tabletop.scene import COLOURS
@@ -37,7 +38,7 @@ def test_tokens_are_the_same_in_every_process_whatever_the_case_but_not_the_orde
     plain, loud, swapped = encoder.tokenize(["red on blue", "Red on BLUE!", "blue on red"])
     assert torch.equal(plain, loud)
     assert set(plain.tolist()) != set(swapped.tolist())
-    program = "from vla.models.text.ngrams import NGrams; encoder = NGrams(4096, 3, 0.0, None, False, width=4)"
+    program = "from vla.models.text.ngrams import NGrams; encoder = NGrams(4096, 3, 0.0, None, False, {}, width=4)"
     program += "; print(encoder.tokenize(['red on blue'])[0].tolist())"
     elsewhere = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert elsewhere.strip() == str(plain.tolist())
@@ -142,6 +143,18 @@ def test_known_words_are_part_of_a_policy_and_take_names_of_colours_for_basic_te
     knowing = make_known_words(["the red block"], basic_colours=True)
     assert torch.equal(knowing.tokenize(["the crimson block"]), encoder.tokenize(["the red block"]))
     assert not torch.equal(encoder.tokenize(["the crimson block"]), encoder.tokenize(["the red block"]))
+
+
+def test_synonyms_are_one_word() -> None:
+    encoder = NGrams(width=8, **defaults_of("model/text/synonyms"))
+    plain, other = encoder.tokenize(
+        ["Pick up the red block and place it on the pad", "grab red block and set it onto pad"]
+    )
+    assert torch.equal(plain, other)
+    there, elsewhere = encoder.tokenize(["pick up the pad", "pick up the putter"])
+    assert not torch.equal(there, elsewhere)
+    with pytest.raises(UserError, match=r"model\.text\.synonyms has 'put' more than once"):
+        NGrams(width=8, **defaults_of("model/text/ngrams", synonyms={"place": ["put"], "put": ["set"]}))
 
 
 @pytest.mark.parametrize(

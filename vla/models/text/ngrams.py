@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import zlib
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated
 
@@ -15,6 +16,7 @@ import torch
 from annotated_types import Ge, Le
 from torch import Tensor, nn
 
+from vla.io.errors import UserError
 from vla.io.types import Rate
 from vla.models.text.colours import in_basic_terms
 
@@ -62,7 +64,11 @@ class NGrams(TextEncoder):
         dropout: rate at which n-grams are dropped in training, which imitates unknown words.
         word_dropout: rate at which words are left out in training; None: unknown words are not left out.
         basic_colours: whether names of colours are replaced by basic terms, see `vla.models.text.colours`.
+        synonyms: words → others that are replaced by them, such as "pick up" → "grab" and "lift"; "" leaves them out.
         width: length of the sentence vector.
+
+    Raises:
+        UserError: words are synonyms of different ones.
     """
 
     heard: Tensor  # (vocabulary,) bool: rows of the words seen in training; None without word dropout
@@ -74,12 +80,14 @@ class NGrams(TextEncoder):
         dropout: Rate,
         word_dropout: Rate | None,
         basic_colours: bool,
+        synonyms: Mapping[str, Sequence[str]],
         *,
         width: int,
     ) -> None:
         super().__init__(width)
         self.vocabulary, self.words, self.basic_colours = vocabulary, words, basic_colours
         self.dropout, self.word_dropout = dropout, word_dropout
+        self.replaced = tuple(_replaced(synonyms).items())  # in the order in which they are looked for
         self.embedding = nn.Embedding(vocabulary, width, padding_idx=PADDING)
         with torch.no_grad():
             self.embedding.weight.mul_(INITIAL_STD)
@@ -89,7 +97,7 @@ class NGrams(TextEncoder):
     def tokenize(self, sentences: list[str]) -> Tensor:
         """Return (B, L) int64 hashes, padded with 0: of n-grams, or with word dropout of words, case ignored."""
         words = None if self.word_dropout is not None else self.words
-        rows = [_hashes(each, self.vocabulary, words, self.basic_colours) for each in sentences]
+        rows = [_hashes(each, self.vocabulary, words, self.basic_colours, self.replaced) for each in sentences]
         return nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=PADDING)
 
     def forward(self, tokens: Tensor) -> Tensor:
@@ -122,9 +130,22 @@ def words_of(sentence: str) -> list[str]:
     return re.findall(r"\w+", sentence.lower())
 
 
+def _replaced(synonyms: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Return words → what replaces them, the longest first; words that others are replaced by stay."""
+    pairs = [(word, chosen) for chosen, others in synonyms.items() for word in (chosen, *others) if word]
+    if twice := sorted({word for word, _ in pairs if sum(word == other for other, _ in pairs) > 1}):
+        raise UserError(f"model.text.synonyms has {', '.join(map(repr, twice))} more than once: omit all but one")
+    return dict(sorted(pairs, key=lambda pair: -len(pair[0])))
+
+
 @lru_cache(KEPT)
-def _hashes(sentence: str, vocabulary: int, longest: int | None, basic_colours: bool) -> Tensor:
+def _hashes(
+    sentence: str, vocabulary: int, longest: int | None, basic_colours: bool, replaced: tuple[tuple[str, str], ...]
+) -> Tensor:
     """Return the hashes of the n-grams of up to `longest` words and of characters, or without it of the words."""
+    if replaced:
+        table = dict(replaced)
+        sentence = re.sub(rf"\b(?:{'|'.join(map(re.escape, table))})\b", lambda word: table[word[0]], sentence.lower())
     words = in_basic_terms(words_of(sentence)) if basic_colours else words_of(sentence)
     # crc32, because hash() differs between processes.
     if longest is None:
