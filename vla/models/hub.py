@@ -7,16 +7,16 @@ from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
+HUB = "hub:"  # before the name of a model
 TIMEOUT = 10  # until the hub counts as unreachable [s]
 
 
-def fetch(repository: str, *patterns: str, revision: str | None = None) -> Path:
+def fetch(name: str, *patterns: str) -> Path:
     """Return a folder with the files of a model that match the patterns, downloading those that are not cached.
 
     Args:
-        repository: OWNER/NAME.
+        name: OWNER/NAME, or OWNER/NAME@REVISION, a branch, a tag or a commit; "hub:" may stand before it.
         patterns: of the names of the files.
-        revision: a branch, a tag or a commit; None: the newest.
 
     Raises:
         OSError: there is no such model, or the hub is unreachable and the model is not cached; the text is one line.
@@ -24,12 +24,13 @@ def fetch(repository: str, *patterns: str, revision: str | None = None) -> Path:
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 
-    reason, name = _unreachable(), f"{repository} at {revision}" if revision else repository
+    reason, (repository, _, revision) = _unreachable(), name.removeprefix(HUB).partition("@")
     try:
         cached = {"local_files_only": reason is not None}
-        return Path(snapshot_download(repository, revision=revision, allow_patterns=list(patterns), **cached))
+        return Path(snapshot_download(repository, revision=revision or None, allow_patterns=list(patterns), **cached))
     except (HfHubHTTPError, HFValidationError) as error:
-        raise OSError(f"it has no public model {name}") from error
+        at = f"{repository} at {revision}" if revision else repository
+        raise OSError(f"it has no public model {at}") from error
     except OSError as error:
         raise OSError(reason or str(error).partition("\n")[0]) from error
 

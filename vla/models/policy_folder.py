@@ -22,7 +22,7 @@ from torch.overrides import TorchFunctionMode
 from vla.io.documents import STRICT, lines_of, parse_json, parse_plain, read_resolved
 from vla.io.errors import UserError
 from vla.io.types import Natural
-from vla.models.hub import fetch
+from vla.models.hub import HUB, fetch
 from vla.models.model import Model
 from vla.models.trunk import Source, require_trunks, whole_state
 from vla.parallel.limits import free_memory, memory
@@ -33,8 +33,7 @@ CONFIG, SPEC, WEIGHTS, TRAINING, CARD = "config.json", "spec.json", "model.safet
 REQUIRED_NODES = ("task", "tokenizer", "model")  # of the config
 OPTIONAL_NODES = ("policy", "chosen", "expert", "collect", "data", "learner", "trainer", "validate")
 TRUTH_MODULES = ("truth_head", "truth_scale")  # modules of a model used in training only
-HUB = "hub:"
-REPOSITORY = re.compile(r"hub:([\w.-]+/[\w.-]+)@([\w./-]+)")
+REPOSITORY = re.compile(HUB + r"[\w.-]+/[\w.-]+@[\w./-]+")
 FACTORIES: tuple[Any, ...] = (
     *(torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.randint, torch.randperm),
     *(torch.arange, torch.linspace, torch.eye),
@@ -153,13 +152,13 @@ def policy_folder(name: str | Path) -> Path:
 @cache
 def _fetched(name: str) -> Path:
     """Return the folder of a policy on the hub, downloading what is not cached: a revision is looked up once."""
-    if (found := REPOSITORY.fullmatch(name)) is None:
+    if REPOSITORY.fullmatch(name) is None:
         raise UserError(
             f"{name} is no policy on the hub: write {HUB}OWNER/NAME@REVISION, a tag, a branch or a commit; one of "
             f"LeRobot is fine-tuned by job=train model=smolvla pretrained={name}"
         )
     try:
-        return fetch(found[1], CONFIG, SPEC, WEIGHTS, TRAINING, CARD, revision=found[2])
+        return fetch(name, CONFIG, SPEC, WEIGHTS, TRAINING, CARD)
     except OSError as error:
         raise UserError(f"{name} cannot be fetched from the Hugging Face hub: {error}") from error
 

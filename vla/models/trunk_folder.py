@@ -7,9 +7,8 @@ from typing import Any
 
 from vla.io.documents import read_json
 from vla.io.errors import UserError
-from vla.models.hub import fetch
+from vla.models.hub import HUB, fetch
 
-HUB = "hub:"
 CONFIG, WEIGHTS = "config.json", "model*.safetensors"
 FILES = (CONFIG, "policy_*", WEIGHTS)
 OF_OTHERS = {"model_type", "input_features"}  # in the config of transformers, and of a policy of LeRobot
@@ -39,9 +38,8 @@ def trunk_folder(name: str) -> Path:
 
 
 def _fetched(name: str, *patterns: str) -> Path:
-    repository, _, revision = name.removeprefix(HUB).partition("@")
     try:
-        return fetch(repository, *patterns, revision=revision or None)
+        return fetch(name, *patterns)
     except OSError as error:
         raise UserError(
             f"{name} cannot be fetched from the Hugging Face hub ({error}): give the folder of a download, or leave it "

@@ -156,9 +156,8 @@ def _folder(name: str | PackagedFile) -> Iterator[Path]:
     elif Path(name).is_dir():
         yield Path(name)
     else:
-        repository, _, revision = name.partition("@")
         try:
-            fetched = fetch(repository, *FILES, revision=revision or None)
+            fetched = fetch(name, *FILES)
         except OSError as error:
             raise UserError(
                 f"model.text.name={name} is no folder here, and cannot be fetched from the Hugging Face hub ({error}): "

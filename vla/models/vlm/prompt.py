@@ -115,10 +115,10 @@ def _tokenizer(name: str) -> tuple[Any, str]:
     """Return the tokenizer in a folder or on the hub, and the SHA-256 of its file."""
     from tokenizers import Tokenizer
 
-    folder, (repository, _, revision) = Path(name), name.partition("@")
+    folder = Path(name)
     if not folder.is_dir():
         try:
-            folder = fetch(repository, FILE, revision=revision or None)
+            folder = fetch(name, FILE)
         except OSError as error:
             raise UserError(
                 f"model.text.name={name} is no folder here, and cannot be fetched from the Hugging Face hub ({error}): "
