@@ -58,7 +58,8 @@ def make_batch(frames: int, chunk: int = 1, size: int = 4, spec: Spec = SPEC) ->
         "unperturbed": torch.ones(size, frames, dtype=torch.bool),
         "truth": torch.randn(size, frames, spec.truth_size),
     }
-    return {**batch, "executed": batch["action"]}
+    none = torch.zeros(size, frames, chunk, dtype=torch.long)
+    return {**batch, "executed": batch["action"], "perturbations": none}
 
 
 def with_text(model: Model, batch: dict[str, Any]) -> dict[str, Any]:

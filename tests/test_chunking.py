@@ -166,6 +166,13 @@ def test_only_what_follows_the_prefix_is_learned() -> None:
     assert torch.equal(loss(executed=torch.where(known, batch["executed"], changed)), expected)
     assert not torch.equal(loss(executed=torch.where(known, changed, batch["executed"])), expected)
     assert not torch.equal(loss(action=torch.where(known, batch["action"], changed)), expected)
+    # What follows a perturbation counts if that was given, and not if it would have had to be foreseen.
+    once = (torch.arange(8) > 0).long().expand(32, 1, 8)
+    foreseen = once.unsqueeze(-1).bool() & ~known.any(2, keepdim=True)
+    assert foreseen.any()
+    expected = loss(perturbations=once)
+    assert torch.equal(loss(perturbations=once, action=torch.where(foreseen, changed, batch["action"])), expected)
+    assert not torch.equal(loss(perturbations=once, action=torch.where(~foreseen, changed, batch["action"])), expected)
 
 
 def test_training_with_prefixes_makes_a_plan_go_on_as_it_began() -> None:
@@ -317,6 +324,7 @@ VLAS: dict[str, tuple[Callable[..., VisionLanguageAction], Spec]] = {
 
 def make_vla(name: str, **options: Any) -> tuple[VisionLanguageAction, Spec]:
     """A tiny vision-language-action model that plans six actions, of which two are executed, and its spec."""
+    torch.manual_seed(0)
     make, spec = VLAS[name]
     model = make(execute=2, prefix=3, normalization="mean_std", **options)
     random = np.random.default_rng(0)
@@ -356,3 +364,6 @@ def test_what_follows_the_prefix_is_learned_by_vision_language_action_models(nam
     assert error(executed=torch.where(known, batch["executed"], changed)) == expected
     assert error(executed=torch.where(known, changed, batch["executed"])) != expected
     assert error(action=torch.where(known, batch["action"], changed)) != expected
+    late = (torch.arange(model.chunk) >= 2).long().expand_as(batch["perturbations"])
+    assert error(perturbations=late * torch.tensor([1, 0])[:, None, None]) == expected  # it was given
+    assert error(perturbations=late * torch.tensor([0, 1])[:, None, None]) != expected

@@ -125,8 +125,9 @@ class WindowBatcher:
 
         A frame before the start of the episode is zero, absent, and has no valid label. A label is also invalid if a
         step between its frame and itself was perturbed, or if it lies beyond the end of the episode, where it repeats
-        the last action. The valid labels of a frame therefore come first. `unperturbed` (B, T): no step
-        within a chunk was perturbed.
+        the last action. The valid labels of a frame therefore come first. `perturbations` (B, T, k): perturbed steps
+        between a frame and each label, -1 beyond the episode. `unperturbed` (B, T): no step within a chunk was
+        perturbed.
         """
         episode = self._first.searchsorted(windows, side="right") - 1  # (B,)
         if not self._verified[episode].all():
@@ -135,11 +136,10 @@ class WindowBatcher:
         frames = windows[:, None] + self._ages  # (B, T)
         labels = frames[:, :, None] + self._aheads  # (B, T, k)
         present = frames >= first
-        valid = (labels <= last[:, :, None]) & present[:, :, None]
+        inside = (labels <= last[:, :, None]) & present[:, :, None]
         labels = np.minimum(np.maximum(labels, first[:, :, None]), last[:, :, None])
         frames = np.maximum(frames, first)
-        if len(self._aheads) > 1:  # no step lies between a frame and its first label
-            valid &= self._perturbations[labels] == self._perturbations[frames][:, :, None]
+        before = self._perturbations[labels] - self._perturbations[frames][:, :, None]
         absent = None if present.all() else ~present
         batch: Batch = {
             kind: {camera: self._take(rows, frames, absent) for camera, rows in cameras.items()}
@@ -153,7 +153,8 @@ class WindowBatcher:
         actions = self._take(self._actions, labels)
         batch["action"], batch["executed"] = actions[..., : self._action_size], actions[..., self._action_size :]
         batch["present"] = self._own(present)
-        batch["valid"] = self._own(valid)
+        batch["valid"] = self._own(inside & (before == 0))
+        batch["perturbations"] = self._own(np.where(inside, before, -1))
         batch["unperturbed"] = self._own(self._perturbations[labels[:, :, -1]] == self._perturbations[frames])
         batch["instruction"] = [self._instructions[number] for number in episode.tolist()]
         return batch

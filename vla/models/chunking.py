@@ -87,6 +87,17 @@ def with_prefix(noisy: Tensor, time: Tensor, clean: Tensor, length: Tensor) -> t
     return torch.where(known.unsqueeze(-1), clean, noisy), time.unsqueeze(1).masked_fill(known, 1.0)
 
 
+def after_prefix(perturbations: Tensor, length: Tensor) -> Tensor:
+    """Return the loss mask (B, k) of chunks that begin with (B,) `length` executed actions.
+
+    Reactions to what was executed are predictable, however perturbed it was: a label counts unless a step between the
+    prefix and itself was perturbed. `perturbations` (B, k) counts those before each label, -1 beyond the episode.
+    """
+    place = torch.arange(perturbations.shape[1], device=length.device)
+    before = perturbations.gather(1, length.unsqueeze(1))
+    return (place >= length.unsqueeze(1)) & (perturbations == before) & (perturbations >= 0)
+
+
 def require_chunking(method: type, model: type, prefix: int) -> None:
     """Raise a UserError unless models of a class, trained with prefixes up to a length, can continue plans."""
     if not getattr(model, "continues", False):

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from vla.io.errors import UserError
 from vla.io.types import Inherited, Layers, NonNegative, Steps
-from vla.models.chunking import with_prefix
+from vla.models.chunking import after_prefix, with_prefix
 from vla.models.layers import Batch, mean_where, transformer_decoder
 from vla.models.model import ContextModel, Prediction
 
@@ -140,7 +140,7 @@ class DenoisingModel(ContextModel):
             executed = self.scaled(batch["executed"][:, -1]).repeat(self.copies, 1, 1)
             length = torch.randint(self.prefix + 1, (len(action),), generator=generator).to(time.device)
             noisy, time = with_prefix(noisy, time, executed, length)
-            counted = counted & (torch.arange(self.chunk, device=time.device) >= length.unsqueeze(1))
+            counted = after_prefix(batch["perturbations"][:, -1].repeat(self.copies, 1), length)
         error = (self.denoiser(noisy, time, context, padding).float() - target).square()
         return {"action_loss": mean_where(error.mean(-1), counted)}
 

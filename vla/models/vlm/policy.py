@@ -19,7 +19,7 @@ from torch import Tensor
 
 from vla.io.errors import UserError
 from vla.io.types import Natural, Shift, Steps, Text
-from vla.models.chunking import require_prefix, with_prefix
+from vla.models.chunking import after_prefix, require_prefix, with_prefix
 from vla.models.layers import Batch, mean_where
 from vla.models.model import Model, Prediction
 from vla.models.tokenizers.tokenizer import ActionTokenizer
@@ -176,9 +176,10 @@ class VisionLanguageAction(Model):
         """Return the mean squared error of the velocity of valid actions, without padding."""
         components = len(self.spec.action)
         error = (output["velocity"] - output["target"])[..., :components].square().mean(-1)
-        counted = batch["valid"][:, -1].repeat(len(error) // len(batch["valid"]), 1)
+        copies = len(error) // len(batch["valid"])
+        counted = batch["valid"][:, -1].repeat(copies, 1)
         if self.prefix:
-            counted = counted & (torch.arange(self.chunk, device=counted.device) >= batch["length"].unsqueeze(1))
+            counted = after_prefix(batch["perturbations"][:, -1].repeat(copies, 1), batch["length"])
         return {"action_loss": mean_where(error, counted)}
 
     def predict(self, batch: Batch) -> Prediction:

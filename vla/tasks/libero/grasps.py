@@ -44,7 +44,7 @@ def choose_grasp(at: Situation, thing: str, place: Place) -> Grasp | None:
     for least, kind in zip(KINDS, kinds, strict=False):
         if best is not None and best[1] < least:
             break  # what is in its way costs less than another kind
-        found = [(width, grasp) for width, grasp in kind if _fits(grasp, points)]
+        found = [(width, grasp) for width, grasp in kind if fits(grasp, points)]
         if not found:
             continue
         moves, hindrances = _costs(at, thing, [one for _, one in found], place)
@@ -152,7 +152,7 @@ def parts(pieces: Sequence[Array], alone: bool = True) -> Iterator[tuple[float, 
                 yield width, Grasp(np.array([*middle, height]), float(yaw))
 
 
-def _fits(grasp: Grasp, points: Array) -> bool:
+def fits(grasp: Grasp, points: Array) -> bool:
     """Return whether the open fingers do not come down on the thing itself."""
     closing, along = axes(grasp.yaw)
     offset = points[:, :2] - grasp.position[:2]

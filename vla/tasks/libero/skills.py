@@ -7,7 +7,7 @@ import numpy as np
 
 from vla.spec import Array
 from vla.tasks.libero.controller import REACH
-from vla.tasks.libero.grasps import LEAN, Grasp, parts
+from vla.tasks.libero.grasps import LEAN, TOUCHING, Grasp, fits, parts, room_of
 from vla.tasks.libero.places import LOOSE, Place
 from vla.tasks.libero.room import HAND, TIP, axes
 from vla.tasks.libero.situation import THIN, Situation
@@ -17,6 +17,7 @@ TURN_GAIN = 1.0  # of the rotation to go: more is unstable where the arm folds u
 HOVER = 0.08  # height over a thing at which it is approached [m]
 NEAR, LEVEL, TURNED = 0.008, 0.008, 0.12  # tolerances of a grasp: across [m], in height [m], in yaw [rad]
 FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approaches come from above
+ROOM = 0.03  # largest distance across at which the hand comes down, if it touches nothing [m]
 MARGIN = 0.015  # height of open fingers over what they must not touch [m]
 FIRM = -0.9  # commanded opening at which they press as much as they can
 CARRY = 0.05  # height over all that is on the way [m]
@@ -30,23 +31,38 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def approach(at: Situation, grasp: Grasp, points: Array, thing: str, opening: float = -1.0) -> Array:
-    """Move to a grasp of points (N, 3) of a thing from above, along the hand, and close the fingers there."""
+    """Move to a grasp of points (N, 3) of a thing from above, along the hand, and close the fingers there.
+
+    The hand comes down where its fingers pass the thing, and corrects the rest meanwhile: if it had to be aligned
+    first, a centimetre, which a policy can hardly see, would decide between up and down.
+    """
     grasp = alike(at, grasp)
     slope = np.array([*(-np.tan(grasp.lean) * axes(grasp.yaw)[1]), 1.0])  # of the line on which the hand comes
     height = at.hand[2] - grasp.position[2]
-    away = float(np.hypot(*(grasp.position + max(height, 0.0) * slope - at.hand)[:2]))
+    offset = (at.hand - grasp.position - max(height, 0.0) * slope) * (1, 1, 0)
+    away = float(np.hypot(*offset[:2]))
     turn = max(abs(at.turn_to(grasp.yaw)), abs(at.lean - grasp.lean))
-    there = away < NEAR and turn < TURNED
-    if there and abs(height) < LEVEL:
+    if away < NEAR and turn < TURNED and abs(height) < LEVEL:
         return command(at, grasp.position, grasp.yaw, 1.0, grasp.lean)
-    # Until it is aligned, the hand stays above all that its fingers could come down on.
-    beside = at.others(thing, grasp.position, HAND)[:, 2]
-    over = max(points[:, 2].max(), beside.max(initial=-np.inf)) + TIP + MARGIN
-    sinking = at.hand[2] < over - 0.01 and away < 1.6 * NEAR and turn < 1.6 * TURNED
+    own = points[:, 2].max() + TIP + MARGIN  # height at which the fingers are above the thing
+    aligned = away < NEAR and turn < TURNED
+    sinking = at.hand[2] < own - 0.01 and away < 1.6 * NEAR and turn < 1.6 * TURNED
+    room = max(min(room_of(at, thing, grasp) - TOUCHING, ROOM), NEAR)
+    between = away < room and turn < 1.6 * TURNED  # of what stands about
+    passing = between and fits(Grasp(grasp.position + offset, at.yaw, grasp.lean), points)
     target = grasp.position.copy()
-    if (opening < 0 and at.opening < 0.5) or not (there or sinking):
-        target = target + (over + min(max(away - NEAR, 0.0) * FUNNEL, HOVER) - target[2]) * slope
+    if (opening < 0 and at.opening < 0.5) or not (aligned or sinking or passing):
+        over = own + _funnel(away - NEAR)
+        if not between:
+            beside = at.others(thing, grasp.position, HAND)[:, 2].max(initial=-np.inf)
+            over = max(over, beside + TIP + MARGIN + _funnel(away - room))
+        target = target + (over - target[2]) * slope
     return command(at, rising(at, target), grasp.yaw, opening, grasp.lean)
+
+
+def _funnel(distance: float) -> float:
+    """Return the height above what is to be passed at a distance from where the hand may be lower [m]."""
+    return min(max(distance, 0.0) * FUNNEL, HOVER)
 
 
 def carry(at: Situation, thing: str, place: Place) -> Array:
