@@ -55,7 +55,6 @@ def make_batch(frames: int, chunk: int = 1, size: int = 4, spec: Spec = SPEC) ->
         "instruction": [f"lift the block number {number}" for number in range(size)],
         "action": low + (high - low) * torch.rand(size, frames, chunk, len(spec.action)),
         "valid": torch.ones(size, frames, chunk, dtype=torch.bool),
-        "unperturbed": torch.ones(size, frames, dtype=torch.bool),
         "truth": torch.randn(size, frames, spec.truth_size),
     }
     none = torch.zeros(size, frames, chunk, dtype=torch.long)

@@ -43,7 +43,6 @@ def naive(store: EpisodeStore, row: int, history: int, chunk: int) -> dict[str, 
         seen["perturbations"] = [
             off[step : step + ahead].sum() if present and step + ahead < entry.steps else -1 for ahead in range(chunk)
         ]
-        seen["unperturbed"] = not off[max(step, 0) : min(max(step + chunk - 1, 0), entry.steps - 1)].any()
         seen["present"] = present
         frames.append(seen)
     return {name: np.stack([frame[name] for frame in frames]) for name in frames[0]} | {"text": entry.instruction}
@@ -65,7 +64,7 @@ def test_a_batch_is_what_a_loop_over_the_episodes_gives(arms: Path, history: int
         for camera in toy.ARM_SPEC.cameras:
             np.testing.assert_array_equal(batch["rgb"][camera][place], expected[f"rgb_{camera}"])
             np.testing.assert_array_equal(batch["depth"][camera][place], expected[f"depth_{camera}"])
-        for name in ("state", "truth", "present", "valid", "perturbations", "unperturbed"):
+        for name in ("state", "truth", "present", "valid", "perturbations"):
             np.testing.assert_array_equal(batch[name][place], expected[name])
         usable = expected["valid"]
         np.testing.assert_array_equal(batch["action"][place].numpy()[usable], expected["labels"][usable])

@@ -28,7 +28,7 @@ def test_cosines_are_the_transform_of_the_book() -> None:
 def test_fast_needs_fewer_tokens_than_there_are_components() -> None:
     tokenizer = TOKENIZER
     tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS.copy()))
-    written = tokenizer.loss_mask(tokens, *(torch.ones(len(CHUNKS), *k, dtype=torch.bool) for k in ((8,), ()))).sum(1)
+    written = tokenizer.loss_mask(tokens, torch.zeros(len(CHUNKS), 8, dtype=torch.long)).sum(1)
     assert written.float().mean() < 0.6 * 8 * 3 and written.max() <= 25
     ends = tokens.gather(1, written[:, None] - 1)
     assert (ends == tokenizer.end).all()
@@ -71,9 +71,8 @@ def test_fast_makes_actions_of_whatever_a_model_writes() -> None:
 def test_a_chunk_counts_as_a_whole() -> None:
     tokenizer = TOKENIZER
     tokens = tokenizer.tokenize(torch.from_numpy(CHUNKS[:3].copy()))
-    valid = torch.zeros(3, 8, dtype=torch.bool)
-    valid[:2, :3] = True  # the first one at the end of its episode, the second one until a perturbation
-    counted = tokenizer.loss_mask(tokens, valid, torch.tensor([True, False, True]))
+    ended, perturbed, absent = [0, 0, 0, -1, -1, -1, -1, -1], [0, 0, 0, 1, 1, 1, 1, 1], [-1] * 8
+    counted = tokenizer.loss_mask(tokens, torch.tensor([ended, perturbed, absent]))
     assert counted[0].sum() == (tokens[0] != tokenizer.end).sum() + 1 and not counted[1:].any()
 
 

@@ -126,8 +126,7 @@ class WindowBatcher:
         A frame before the start of the episode is zero, absent, and has no valid label. A label is also invalid if a
         step between its frame and itself was perturbed, or if it lies beyond the end of the episode, where it repeats
         the last action. The valid labels of a frame therefore come first. `perturbations` (B, T, k): perturbed steps
-        between a frame and each label, -1 beyond the episode. `unperturbed` (B, T): no step within a chunk was
-        perturbed.
+        between a frame and each label, -1 beyond the episode.
         """
         episode = self._first.searchsorted(windows, side="right") - 1  # (B,)
         if not self._verified[episode].all():
@@ -155,7 +154,6 @@ class WindowBatcher:
         batch["present"] = self._own(present)
         batch["valid"] = self._own(inside & (before == 0))
         batch["perturbations"] = self._own(np.where(inside, before, -1))
-        batch["unperturbed"] = self._own(self._perturbations[labels[:, :, -1]] == self._perturbations[frames])
         batch["instruction"] = [self._instructions[number] for number in episode.tolist()]
         return batch
 

@@ -109,7 +109,7 @@ class Decoder(ContextModel):
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
         """Return the tokenizer's loss over unmasked tokens and, outside training, their accuracy."""
         logits, tokens = output["logits"].float(), output["tokens"]
-        mask = self.tokenizer.loss_mask(tokens, batch["valid"][:, -1], batch["unperturbed"][:, -1])  # (B, L)
+        mask = self.tokenizer.loss_mask(tokens, batch["perturbations"][:, -1])  # (B, L)
         losses = self.tokenizer.token_losses(logits, tokens, batch["action"][:, -1])
         result = {"action_loss": mean_where(losses, mask)}
         if not self.training:

@@ -41,10 +41,9 @@ class Model(nn.Module, ABC):
         rgb: camera → (B, T, H, W, 3) uint8 of `image_size`; state: (B, T, P) float32; present: (B, T) bool, false for
         padding; text: from `text.tokenize`. For training also action: (B, T, k, D) float32; valid: (B, T, k) bool, the
         loss mask, true for a prefix of each chunk; executed: what the robot did, as action; perturbations: (B, T, k)
-        int, perturbed steps before each label, -1 beyond the episode; unperturbed: (B, T) bool, false where one falls
-        in the chunk; truth: (B, T, S) float32. For generative models optionally noise: (B, k, D) float32, standard
-        normal; for plans that continue others running: (B, k, D) float32, remaining and delay: (B,), see
-        `chunking.Running`.
+        int, perturbed steps before each label, -1 beyond the episode; truth: (B, T, S) float32. For generative models
+        optionally noise: (B, k, D) float32, standard normal; for plans that continue others running: (B, k, D)
+        float32, remaining and delay: (B,), see `chunking.Running`.
 
     A policy executes the first `execute` of the k actions before it predicts again.
 

@@ -101,13 +101,13 @@ class Fast(ActionTokenizer):
         scaled = _exact(self.basis.T, coefficients.view(-1, self.chunk, self.components)) / self.scale
         return (scaled * self.spread + self.centre).view(*tokens.shape[:-1], self.chunk, self.components)
 
-    def loss_mask(self, tokens: Tensor, valid: Tensor, unperturbed: Tensor) -> Tensor:
-        """Return the (…, L) bool loss mask: tokens up to the first end token of unperturbed chunks with a valid action.
+    def loss_mask(self, tokens: Tensor, perturbations: Tensor) -> Tensor:
+        """Return the (…, L) bool loss mask: tokens up to the first end token of chunks in which nothing is perturbed.
 
         Every token depends on all actions of a chunk. Actions that repeat the last one of an episode are meant to be.
         """
         ended = (tokens == self.end).cumsum(-1)
-        whole = valid[..., 0] & unperturbed
+        whole = perturbations.amax(-1) == 0
         return ((ended == 0) | ((ended == 1) & (tokens == self.end))) & whole[..., None]
 
     def get_extra_state(self) -> dict[str, Any]:

@@ -80,8 +80,8 @@ class ActionTokenizer(nn.Module, ABC):
         """Decode any (…, L) tokens as (…, k, D) float actions."""
 
     @abstractmethod
-    def loss_mask(self, tokens: Tensor, valid: Tensor, unperturbed: Tensor) -> Tensor:
-        """Return the (…, L) bool loss mask, given the (…, k) bool mask of actions and the (…) one of whole chunks."""
+    def loss_mask(self, tokens: Tensor, perturbations: Tensor) -> Tensor:
+        """Return the (…, L) bool loss mask, given (…, k) perturbed steps before each action, -1 beyond the episode."""
 
     def token_losses(self, logits: Tensor, tokens: Tensor, actions: Tensor) -> Tensor:
         """Return the (…, L) losses of (…, L, K) logits against the (…, L) tokens of (…, k, D) actions."""
@@ -130,9 +130,9 @@ class PerComponent(ActionTokenizer):
         """Decode (…, k·D) tokens as (…, k, D) float actions."""
         return self.decode(self._split(tokens, -1))
 
-    def loss_mask(self, tokens: Tensor, valid: Tensor, unperturbed: Tensor) -> Tensor:
-        """Return the (…, k·D) bool loss mask: the tokens of valid actions."""
-        return valid.repeat_interleave(self.components, -1)
+    def loss_mask(self, tokens: Tensor, perturbations: Tensor) -> Tensor:
+        """Return the (…, k·D) bool loss mask: the tokens of actions that no perturbed step precedes."""
+        return (perturbations == 0).repeat_interleave(self.components, -1)
 
     def token_losses(self, logits: Tensor, tokens: Tensor, actions: Tensor) -> Tensor:
         """Return the (…, k·D) losses of (…, k·D, K) logits against (…, k, D) actions."""

@@ -65,20 +65,21 @@ class RendererFactory(Protocol):
 class LazyRenderer:
     """A renderer that is made with the first picture, because blind worlds need no GL."""
 
-    def __init__(self, factory: RendererFactory, model: mujoco.MjModel, views: Views) -> None:
-        """Args: what makes it; the model; what is drawn of it."""
-        self._open = partial(factory.open, model, views)
+    def __init__(
+        self, factory: RendererFactory, model: mujoco.MjModel, views: Views, textures: set[int] | None = None
+    ) -> None:
+        """Args: what makes it; the model; what to draw; ids of textures with new pixels, which a picture empties."""
+        self._open, self._textures = partial(factory.open, model, views), set() if textures is None else textures
         self._renderer: Renderer | None = None
         self.changed = False  # whether the model has, since the last picture
 
-    def render(
-        self, data: mujoco.MjData, windows: Array | None = None, textures: Collection[int] = ()
-    ) -> tuple[Array, Array]:
-        """Draw every camera's picture, as `Renderer.render`; `textures` are the ids of those whose pixels changed."""
+    def render(self, data: mujoco.MjData, windows: Array | None = None) -> tuple[Array, Array]:
+        """Draw every camera's picture, as `Renderer.render`."""
         if self._renderer is None:
             self._renderer = self._open()
         elif self.changed:
-            self._renderer.update(textures)
+            self._renderer.update(self._textures)
+        self._textures.clear()
         self.changed = False
         return self._renderer.render(data, windows)
 

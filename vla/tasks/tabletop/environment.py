@@ -104,7 +104,7 @@ class Tabletop(World):
         bounds = np.array(self.spec.low), np.array(self.spec.high)
         self.simulation = Simulation(goal, randomize, scene, *bounds, time_limit)
         views = Views([scene.cameras[name] for name in cameras], *self.spec.image_size, geom_groups=(VISIBLE,))
-        self.renderer = LazyRenderer(renderer, scene.model, views)
+        self.renderer = LazyRenderer(renderer, scene.model, views, scene.stale_textures)
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`."""
@@ -209,8 +209,7 @@ class Tabletop(World):
         """Return the current observation."""
         compiled, rgb, depth = self.simulation.compiled, {}, {}
         if not self._blind:
-            pictures, metres = self.renderer.render(compiled.data, textures=compiled.stale_textures)
-            compiled.stale_textures.clear()
+            pictures, metres = self.renderer.render(compiled.data)
             if compiled.noise.image:
                 pictures = self._grainy(pictures)
             millimetres = np.rint(metres * np.float32(MILLIMETRES)).astype(np.uint16)
