@@ -106,6 +106,7 @@ def test_labels_that_are_not_valid_count_for_nothing(name: str) -> None:
     model, batch = made(name)
     model.auxiliary = 0.0
     batch["valid"][:, :, 1:], batch["valid"][0] = False, False
+    batch["perturbations"][~batch["valid"]] = -1
     other = {**batch, "action": batch["action"].clone()}
     other["action"][~batch["valid"]] = 0.01
     losses = []
