@@ -46,6 +46,7 @@ from vla.data.episodes import EpisodeStore
 from vla.data.formats import lerobot_tables as tables
 from vla.data.formats.lerobot_images import decode, encode, require_video
 from vla.data.formats.lerobot_import import LeRobotDemonstrations
+from vla.io.errors import UserError
 from vla.io.parts import Part
 from vla.spec import Spec
 
@@ -237,8 +238,16 @@ def relabelled(home: Path, folder: Path, tasks: Callable[[pa.Table], Any]) -> Pa
     return dataset
 
 
-def recording(dataset: Path) -> Any:
-    return LeRobotDemonstrations.recording(**defaults_of("expert/lerobot", folder=dataset))
+def recording(dataset: Path, **options: Any) -> Any:
+    return LeRobotDemonstrations.recording(**defaults_of("expert/lerobot", folder=dataset, **options))
+
+
+def test_actions_can_have_other_units_and_steps_another_rate(home: Path) -> None:
+    plain, other = (recording(home / "dataset", **options) for options in ({}, {"scale": {"y": -2.0}, "control_hz": 7}))
+    assert (plain.control_hz, other.control_hz) == (10, 7)
+    assert other.bounds == plain.bounds | {"y": (-2 * plain.bounds["y"][1], -2 * plain.bounds["y"][0])}
+    with pytest.raises(UserError, match=r"expert\.scale names z, the actions are x, y, gripper"):
+        demonstrations(home / "dataset", ARM_SPEC, scale={"z": 2.0})
 
 
 def test_every_step_has_the_instruction_of_its_task(home: Path, tmp_path: Path, caplog: Any) -> None:

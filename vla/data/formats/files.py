@@ -24,7 +24,6 @@ from vla.io.files import write_json, writing
 from vla.io.printable import track
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster, WorkersLost
-from vla.spec import Array, Spec
 
 MILLIMETRE = np.float32(0.001)  # [m]
 
@@ -68,14 +67,9 @@ class Files:
         entry = store.episodes[number]
         draft = place / f"episode_{number:05d}"
         shutil.rmtree(draft, ignore_errors=True)  # left by an interrupted export
-        self.write(draft, store.spec, entry, store.read(entry))
-        write_json(draft / "manifest.json", self._manifest(store, number))
-        os.rename(draft, self._folder / draft.name)
-
-    def write(self, folder: Path, spec: Spec, entry: Entry, rows: dict[str, Array]) -> None:
-        """Write the (steps, …) rows of an episode, by field, into the new folder `folder`."""
+        spec, rows = store.spec, store.read(entry)
         for step in range(entry.steps):
-            place = folder / f"step_{step:04d}"
+            place = draft / f"step_{step:04d}"
             for camera in spec.cameras:
                 images = place / camera if len(spec.cameras) > 1 else place
                 images.mkdir(parents=True)
@@ -86,6 +80,8 @@ class Files:
             write_json(place / "robot_state.json", state)
             actions = {name: rows[name][step].tolist() for name in ("action", "executed")}
             write_json(place / "expert_action.json", actions)
+        write_json(draft / "manifest.json", self._manifest(store, number))
+        os.rename(draft, self._folder / draft.name)
 
 
 def provenance(entry: Entry) -> dict[str, Any]:

@@ -76,16 +76,14 @@ class LeRobotDataset:
             raise UserError(f"expert.images: {folder} has no images {', '.join(unknown)}, it has {', '.join(keys)}")
         self.parts = self._read_parts([key for key in self.images.values() if self._is_video(key)])
 
-    @property
-    def control_hz(self) -> float:
-        """Rate of the actions [Hz]."""
-        return self.info.fps
-
-    def components(self, keys: Sequence[str], anonymous: Sequence[str] = ()) -> dict[str, tuple[str, int]]:
+    def components(
+        self, keys: Sequence[str], anonymous: Sequence[str] = (), in_order: bool = False
+    ) -> dict[str, tuple[str, int]]:
         """Return component → its feature and index, of several features in order (UserError: there is no such feature,
         or it is no vector of a reasonable size).
 
-        Unnamed components are called by `anonymous` if there are as many, else by their feature and index.
+        Unnamed components, or with `in_order` all, are called by `anonymous` if there are as many; else unnamed ones by
+        their feature and index.
         """
         features = self.info.features
         vectors = [key for key, feature in features.items() if len(feature.shape) == 1]
@@ -96,6 +94,8 @@ class LeRobotDataset:
                 raise UserError(f"{self.folder} has {size} components in {key}, the limit is {MAX_COMPONENTS}")
         places = [(key, index) for key in keys for index in range(features[key].shape[0])]
         numbered = [f"{key.rpartition('.')[2]}_{index}" for key, index in places]
+        if in_order and len(places) == len(anonymous):
+            return dict(zip(anonymous, places, strict=True))
         if not any(features[key].components for key in keys):
             by_number = len(places) != len(anonymous) or {*numbered} >= {*anonymous}
             return dict(zip(numbered if by_number else anonymous, places, strict=True))

@@ -6,7 +6,7 @@ Shapes: N steps, P state components, D action components, H by W pixels.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +18,7 @@ from vla.data.formats import imported_demonstrations as imported
 from vla.data.formats import lerobot_layout as layout
 from vla.data.formats.lerobot_dataset import LeRobotDataset
 from vla.io.errors import UserError
-from vla.io.types import Count, Text, unique
+from vla.io.types import Count, Positive, Text, unique
 from vla.spec import Array, Episode, Spec
 
 Keys = Annotated[list[Text], MinLen(1), Predicate(unique)]
@@ -48,6 +48,9 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         images: camera → key of its images; None: `observation.images.CAMERA`.
         state, action: keys of the features that hold the components, which are found by name.
         every: keep every n-th frame with the last of n actions, which suits absolute actions only.
+        scale: action component → factor on the dataset's actions; None: 1.
+        control_hz: rate of the frames [Hz]; None: as the dataset says.
+        in_order: the components of state and action are those of the task in its order, whatever their names.
         spec: of the task.
     """
 
@@ -58,14 +61,18 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         state: Keys,
         action: Keys,
         every: Count,
+        scale: dict[str, float] | None,
+        control_hz: Positive | None,
+        in_order: bool,
         *,
         spec: Spec,
     ) -> None:
         self.spec, self._every = spec.without_truth, every
-        self._dataset = dataset = self._opened(folder, images)
+        self._dataset = dataset = _opened(folder, images)
+        self._control_hz = (control_hz or dataset.info.fps) / every
         features = dataset.info.features
-        self._state = dataset.components(state, [spec.state[index] for index in spec.pose])
-        self._action = dataset.components(action, spec.action)
+        self._state = dataset.components(state, [spec.state[index] for index in spec.pose], in_order)
+        self._action = dataset.components(action, spec.action, in_order)
         rates = [key for key in (layout.RATES,) if key in features and features[key].components]
         for name, place in dataset.components(rates).items():
             self._state.setdefault(name, place)
@@ -77,7 +84,7 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         if all(name in self._action for name in spec.action):
             read = [*state, *action, *rates, *executed]
             self._numbers = dataset.read(list(dict.fromkeys(read)))
-            self._actions = self._columns(spec.action, self._action, slice(None))
+            self._actions = self._columns(spec.action, self._action, slice(None)) * _factors(scale, spec.action)
             differences += imported.out_of_bounds(self._actions, spec, MAX_OUTSIDE)
         if differences:
             raise UserError(f"{dataset.folder} does not match the task: {'; '.join(differences)}")
@@ -88,18 +95,27 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
 
     @classmethod
     def recording(
-        cls, folder: Path | str | None, images: dict[str, Text] | None, state: Keys, action: Keys, every: Count
+        cls,
+        folder: Path | str | None,
+        images: dict[str, Text] | None,
+        state: Keys,
+        action: Keys,
+        every: Count,
+        scale: dict[str, float] | None,
+        control_hz: Positive | None,
+        in_order: bool,
     ) -> imported.Recording:
         """Describe a dataset, see `ImportedDemonstrations.recording`."""
-        dataset = cls._opened(folder, images)
+        dataset = _opened(folder, images)
         states, actions = dataset.components(state), dataset.components(action)
-        values = dataset.read(action)
+        values, factors = dataset.read(action), _factors(scale, [*actions])
+        places = zip(actions.items(), factors, strict=True)
         return imported.Recording(
             cameras=tuple(dataset.images),
-            control_hz=dataset.info.fps / every,
+            control_hz=(control_hz or dataset.info.fps) / every,
             state=tuple(states),
             action=tuple(actions),
-            bounds={name: imported.action_bounds(values[key][:, at]) for name, (key, at) in actions.items()},
+            bounds={name: imported.action_bounds(factor * values[key][:, at]) for (name, (key, at)), factor in places},
             episodes=len(dataset.parts),
         )
 
@@ -132,16 +148,12 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         imported.log_clipped(self._actions, self.spec)
         return super().fill(store, episodes)
 
-    @staticmethod
-    def _opened(folder: Path | str | None, images: dict[str, Text] | None) -> LeRobotDataset:
-        return LeRobotDataset(named(folder), images)
-
     def _mismatches(self) -> Iterator[str]:
         """Yield the differences between the spec and the metadata of the dataset."""
         dataset, spec = self._dataset, self.spec
-        if abs(dataset.control_hz / self._every - spec.control_hz) > layout.RATE_TOLERANCE * spec.control_hz:
+        if abs(self._control_hz - spec.control_hz) > layout.RATE_TOLERANCE * spec.control_hz:
             kept = f" and expert.every={self._every}" if self._every > 1 else ""
-            yield f"a rate of {dataset.info.fps:g} Hz{kept}, the task has {spec.control_hz:g} Hz"
+            yield f"a rate of {self._control_hz * self._every:g} Hz{kept}, the task has {spec.control_hz:g} Hz"
         if missing := [camera for camera in spec.cameras if camera not in dataset.images]:
             yield f"no images of {' and '.join(missing)}, it has {_shortened(dataset.images) or 'none at all'}"
         derived = spec.robot.velocities if spec.robot else ()
@@ -158,7 +170,7 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         spec, known = self.spec, dict[str, Array]()
         if layout.RATES in self._lacks and spec.robot:
             joints = self._columns(spec.robot.joints, self._state, rows)
-            rates = np.diff(joints, axis=0, prepend=joints[:1]) * np.float32(self._dataset.info.fps)
+            rates = np.diff(joints, axis=0, prepend=joints[:1]) * np.float32(self._control_hz * self._every)
             known = dict(zip(spec.robot.velocities, rates.T, strict=True))
         names = [name for name in spec.state if name in self._state]
         known |= dict(zip(names, self._columns(names, self._state, rows).T, strict=True))
@@ -174,8 +186,15 @@ def _shortened(names: Iterable[str]) -> str:
     return text if len(text) <= MAX_NAMES else f"{text[:MAX_NAMES]}…"
 
 
-def named(folder: Path | str | None) -> Path:
-    """Require the folder of a dataset to be named."""
+def _opened(folder: Path | str | None, images: dict[str, Text] | None) -> LeRobotDataset:
     if folder is None:
         raise UserError("expert=lerobot needs a dataset: name its folder with expert=lerobot expert.folder=DIR")
-    return Path(folder)
+    return LeRobotDataset(Path(folder), images)
+
+
+def _factors(scale: Mapping[str, float] | None, names: Sequence[str]) -> Array:
+    """Return the factors of action components, (D,) float32; a UserError if `scale` names others."""
+    scale = scale or {}
+    if unknown := [name for name in scale if name not in names]:
+        raise UserError(f"expert.scale names {', '.join(unknown)}, the actions are {_shortened(names)}")
+    return np.array([scale.get(name, 1.0) for name in names], np.float32)
