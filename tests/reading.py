@@ -22,7 +22,6 @@ def windows(folder: Path, **changes: Any) -> WindowDataModule:
         "batch_size": 8,
         "validation_fraction": 0.2,
         "validation_windows": 40,
-        "depth": False,
         "ahead": 2,
     }
     module = WindowDataModule(folder, **{**settings, **changes})

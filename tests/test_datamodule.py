@@ -58,12 +58,11 @@ def arms(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_batch_is_what_a_loop_over_the_episodes_gives(arms: Path, history: int, chunk: int) -> None:
     store = EpisodeStore(arms)
     chosen = np.concatenate([np.arange(store.episodes[5].start - 2, store.episodes[5].start + 9), [0, 1]])
-    batch = WindowBatcher(store, history, chunk, depth=True)(chosen)
+    batch = WindowBatcher(store, history, chunk)(chosen)
     for place, row in enumerate(chosen):
         expected = naive(store, row, history, chunk)
         for camera in toy.ARM_SPEC.cameras:
             np.testing.assert_array_equal(batch["rgb"][camera][place], expected[f"rgb_{camera}"])
-            np.testing.assert_array_equal(batch["depth"][camera][place], expected[f"depth_{camera}"])
         for name in ("state", "truth", "present", "valid", "perturbations"):
             np.testing.assert_array_equal(batch[name][place], expected[name])
         usable = expected["valid"]
@@ -75,13 +74,12 @@ def test_a_batch_is_what_a_loop_over_the_episodes_gives(arms: Path, history: int
         assert batch["instruction"][place] == expected["text"]
 
 
-def test_shapes_and_types_are_those_of_the_contract(folder: Path, arms: Path) -> None:
-    batch = next(iter(windows(arms, spec=toy.ARM_SPEC, depth=True).train_dataloader()))
+def test_shapes_and_types_are_those_of_the_contract(arms: Path) -> None:
+    batch = next(iter(windows(arms, spec=toy.ARM_SPEC).train_dataloader()))
     assert {name: (tuple(image.shape), image.dtype) for name, image in batch["rgb"].items()} == {
         "front": ((8, 3, 16, 16, 3), torch.uint8),
         "wrist": ((8, 3, 16, 16, 3), torch.uint8),
     }
-    assert batch["depth"]["wrist"].shape == (8, 3, 16, 16) and batch["depth"]["wrist"].dtype == torch.int32
     assert {name: (tuple(batch[name].shape), batch[name].dtype) for name in ("state", "truth", "action")} == {
         "state": ((8, 3, 15), torch.float32),
         "truth": ((8, 3, 4), torch.float32),
@@ -90,8 +88,7 @@ def test_shapes_and_types_are_those_of_the_contract(folder: Path, arms: Path) ->
     assert batch["present"].shape == (8, 3) and batch["present"].dtype == torch.bool
     assert batch["valid"].shape == (8, 3, 2) and batch["valid"].dtype == torch.bool
     assert len(batch["instruction"]) == 8
-    assert "depth" not in next(iter(windows(folder).train_dataloader()))
-    assert next(iter(windows(folder, depth=True).train_dataloader()))["depth"] == {}
+    assert "depth" not in batch
 
 
 def test_a_further_store_may_lack_the_truth(folder: Path, tmp_path: Path) -> None:

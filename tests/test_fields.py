@@ -53,7 +53,7 @@ def test_without_loss_batches_episodes_and_index_are_those_of_a_raw_store(tmp_pa
     nearest = [NearestDemonstration(store.folder, None, spec=ARM_SPEC) for store in (raw, small)]
     np.testing.assert_array_equal(nearest[0]._images, nearest[1]._images)
     for history in (1, 6):
-        made = [WindowBatcher(store, history, 2, depth=True)(rows) for store in (small, raw)]
+        made = [WindowBatcher(store, history, 2)(rows) for store in (small, raw)]
         assert same(*made) and made[0]["rgb"]["front"].any()
     for entry in raw.episodes:
         expected = raw.read(entry)

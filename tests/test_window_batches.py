@@ -35,13 +35,13 @@ def test_a_step_is_perturbed_if_the_executed_action_differs_from_the_label_by_mo
 
 def test_memory_is_used_again_once_nothing_refers_to_it() -> None:
     memory = BufferPool()
-    first = memory.empty((2, 3), np.uint8)
+    first = memory.empty((2, 3), torch.uint8)
     tensor = torch.from_numpy(first).view(3, 2)[1:]
     place = first.__array_interface__["data"]
     del first
-    assert memory.empty((2, 3), np.uint8).__array_interface__["data"] != place
+    assert memory.empty((2, 3), torch.uint8).__array_interface__["data"] != place
     del tensor
-    assert memory.empty((2, 3), np.uint8).__array_interface__["data"] == place
+    assert memory.empty((2, 3), torch.uint8).__array_interface__["data"] == place
 
 
 def test_rows_in_random_order_are_those_of_the_file(tmp_path: Path) -> None:

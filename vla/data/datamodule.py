@@ -107,7 +107,6 @@ class WindowDataModule(LightningDataModule):
         batch_size: windows B in a batch, per process.
         validation_fraction: share of the episodes held out, 0…1; 0 trains on all of them and does not validate.
         validation_windows: approximate number of held-out windows per validation, over all processes.
-        depth: include depth in batches.
         ahead: batches made in advance.
         tokenize: sentences → tensor, added to batches as `text`; None adds nothing.
         episodes: use only the first so many episodes; all of them when None.
@@ -124,7 +123,6 @@ class WindowDataModule(LightningDataModule):
         batch_size: Count,
         validation_fraction: Rate,
         validation_windows: Count,
-        depth: bool,
         ahead: Natural,
         tokenize: Callable[[list[str]], Tensor] | None = None,
         episodes: Count | None = None,
@@ -133,7 +131,7 @@ class WindowDataModule(LightningDataModule):
         super().__init__()
         self.batch_size = batch_size
         self._folder, self._spec, self._episodes, self._more = Path(folder), spec, episodes, more
-        self._history, self._chunk, self._depth = history, chunk, depth
+        self._history, self._chunk = history, chunk
         self._seed, self.ahead, self._tokenize = seed, ahead, tokenize
         self._fraction, self._validation_windows = validation_fraction, validation_windows
 
@@ -158,7 +156,7 @@ class WindowDataModule(LightningDataModule):
         self._digest = digest_of(episodes)
         self.training_windows = np.concatenate(trained)  # row numbers
         self.held_out_windows = np.concatenate([np.empty(0, np.int64), *unseen])
-        layout = self._history, self._chunk, self._depth, self._on_gpu(), self._spec.truth_size
+        layout = self._history, self._chunk, self._on_gpu(), self._spec.truth_size
         self.make_batch = JoinedBatcher([WindowBatcher(store, *layout) for store in stores], rows)
 
     def state_dict(self) -> dict[str, str]:

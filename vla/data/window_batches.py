@@ -6,25 +6,17 @@ Shapes: B batch, T history frames, k action chunk, D action components, S truth 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import prod
 from sys import getrefcount
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import DTypeLike
 
 from vla.data.episodes import EpisodeStore
 from vla.data.fields import Rows
 from vla.spec import Array, Spec
 
 Batch = dict[str, Any]
-
-# dtype of a field → dtype of its tensor: torch supports few operations on uint16.
-TYPES = {np.dtype(np.uint8): torch.uint8, np.dtype(np.uint16): torch.int32, np.dtype(np.float32): torch.float32}
-NUMPY = {torch.uint8: np.uint8, torch.int32: np.int32, torch.float32: np.float32}
-
-CACHE_LINE = 64  # bytes
 
 # An executed action counts as perturbed if it differs from the label by more than this share of the label, and of the
 # action range.
@@ -41,16 +33,6 @@ def perturbed(action: Array, executed: Array, spec: Spec) -> Array:
     return np.any(off, axis=1)
 
 
-def aligned_empty(shape: tuple[int, ...], dtype: DTypeLike) -> Array:
-    """Return an array with arbitrary content that starts at a cache line, to which some processors copy twice as fast.
-
-    NumPy's own arrays start 16 bytes after one.
-    """
-    size = prod(shape) * np.dtype(dtype).itemsize
-    memory = bytearray(size + CACHE_LINE)  # no array, so that views refer to the result
-    return np.ndarray(shape, dtype, memory, offset=-np.frombuffer(memory, np.uint8).ctypes.data % CACHE_LINE)
-
-
 class BufferPool:
     """Pool of arrays that are reused once no array, view or tensor refers to them.
 
@@ -61,15 +43,18 @@ class BufferPool:
     def __init__(self) -> None:
         self._arrays: dict[tuple[Any, ...], list[Array]] = {}
 
-    def empty(self, shape: tuple[int, ...], dtype: type) -> Array:
-        """Return an array with arbitrary content."""
+    def empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Array:
+        """Return an array with arbitrary content.
+
+        It is torch's, as those of NumPy start beside a cache line, to which some processors copy half as fast.
+        """
         length, *rest = shape
         arrays = self._arrays.setdefault((*rest, dtype), [])
         for array in arrays:
             # References of the list, of `array` and of the argument; another thread at this line adds a fourth.
             if len(array) >= length and getrefcount(array) == 3:
                 return array[:length]
-        arrays.append(aligned_empty(shape, dtype))
+        arrays.append(torch.empty(shape, dtype=dtype).numpy())
         return arrays[-1][:]
 
 
@@ -82,7 +67,6 @@ class WindowBatcher:
         store: source of the rows.
         history: frames T in a window.
         chunk: actions k that label a frame.
-        depth: include depth.
         pin: allocate page-locked memory, from which copies to a GPU are asynchronous.
         truth_size: number S of truth scalars, NaN if the store has no truth; None: that of the store.
     """
@@ -92,14 +76,12 @@ class WindowBatcher:
         store: EpisodeStore,
         history: int,
         chunk: int,
-        depth: bool = False,
         pin: bool = False,
         truth_size: int | None = None,
     ) -> None:
         self._pin, self._buffers = pin, BufferPool()
         self._ages, self._aheads = np.arange(1 - history, 1), np.arange(chunk)
-        cameras = {"rgb": store.spec.cameras, **({"depth": store.spec.depth} if depth else {})}
-        self._images = {kind: {name: store.rows(f"{kind}_{name}", True) for name in of} for kind, of in cameras.items()}
+        self._images = {camera: store.rows(f"rgb_{camera}", True) for camera in store.spec.cameras}
         # Two arrays, of frames and of labels: the row look-up costs more than the copy of a few numbers.
         names = ("state", *(("truth",) if store.spec.truth else ()))
         numbers = {name: store.rows(name) for name in (*names, "action", "executed")}
@@ -140,10 +122,7 @@ class WindowBatcher:
         frames = np.maximum(frames, first)
         before = self._perturbations[labels] - self._perturbations[frames][:, :, None]
         absent = None if present.all() else ~present
-        batch: Batch = {
-            kind: {camera: self._take(rows, frames, absent) for camera, rows in cameras.items()}
-            for kind, cameras in self._images.items()
-        }
+        batch: Batch = {"rgb": {camera: self._take(rows, frames, absent) for camera, rows in self._images.items()}}
         numbers = self._take(self._numbers, frames, absent)
         state = self._numbers.shape[1] - self._truth_size
         batch["state"] = numbers[..., :state]
@@ -164,16 +143,12 @@ class WindowBatcher:
         """
         episodes = np.arange(len(self._entries)) if episodes is None else episodes
         entries = [self._entries[number] for number in episodes.tolist()]
-        images = {f"{kind}_{camera}": rows for kind, of in self._images.items() for camera, rows in of.items()}
-        self._store.verify(entries, images)
+        self._store.verify(entries, {f"rgb_{camera}": rows for camera, rows in self._images.items()})
         self._verified[episodes] = True
 
     def _take(self, rows: Rows, index: Array, absent: Array | None = None) -> torch.Tensor:
-        values = self._empty((*index.shape, *rows.shape[1:]), TYPES[rows.dtype])
-        if values.dtype == rows.dtype:
-            rows.take(index, axis=0, out=values, mode="clip")  # "clip" writes into `out` without a buffer
-        else:
-            values[...] = rows.take(index, axis=0)
+        values = self._empty((*index.shape, *rows.shape[1:]), getattr(torch, rows.dtype.name))
+        rows.take(index, axis=0, out=values, mode="clip")  # "clip" writes into `out` without a buffer
         if absent is not None:
             values[absent] = 0  # many times faster than in torch
         return torch.from_numpy(values)
@@ -181,7 +156,7 @@ class WindowBatcher:
     def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Array:
         if self._pin:
             return torch.empty(shape, dtype=dtype, pin_memory=True).numpy()
-        return self._buffers.empty(shape, NUMPY[dtype])
+        return self._buffers.empty(shape, dtype)
 
     def _own(self, values: Array) -> torch.Tensor:
         tensor = torch.from_numpy(values)

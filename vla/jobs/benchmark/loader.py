@@ -8,12 +8,12 @@ from math import prod
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import torch
 
 from vla.config.experiment import Experiment
 from vla.config.nodes import Benchmark
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
-from vla.data.window_batches import aligned_empty
 from vla.jobs.benchmark.measure import Measure, measure, timed
 from vla.jobs.collect import demonstrations
 from vla.rollouts.rollout import rollout
@@ -84,7 +84,8 @@ def _loading(experiment: Experiment, store: EpisodeStore, history: int, chunk: i
         rows.append(np.maximum(windows[:, None] + np.arange(1 - history, 1), first[:, None]))  # (B, T)
 
     # Into two batches by turns, because one is in use while the next is made: a single one would stay in the cache.
-    buffers = [[aligned_empty((*rows[0].shape, *image.shape[1:]), image.dtype) for image in images] for _ in range(2)]
+    shapes = [(*rows[0].shape, *image.shape[1:]) for image in images]
+    buffers = [[torch.empty(shape, dtype=torch.uint8).numpy() for shape in shapes] for _ in range(2)]
 
     def bare() -> None:
         for index, arrays in zip(rows, cycle(buffers)):
