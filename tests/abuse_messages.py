@@ -38,7 +38,7 @@ def messages(root: Path) -> Trials:
         "deploy=ros2",
         "output=deployed",
     ]
-    with (root / "deployed.log").open("w") as log, ros(RosNetwork.named("loopback")):
+    with (root / "deployed.log").open("w") as log, ros(RosNetwork("loopback", None, None)):
         process = subprocess.Popen(command, cwd=root, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
         try:
             world = World(replace(ROBOT, fingers=["panda_finger_joint1", "panda_finger_joint2"]))

@@ -297,7 +297,7 @@ def test_missing_messages_are_named_before_anything_else(
     options = {"command": "joint_state", "gripper": None, **changed}
     deployment = PolicyDeployment(
         **defaults_of("deploy/ros2", **options),
-        **{"robot": ROBOT, "network": RosNetwork.named("loopback"), "topics": TOPICS, "safety": SAFETY},
+        **{"robot": ROBOT, "network": RosNetwork("loopback", None, None), "topics": TOPICS, "safety": SAFETY},
         **{"policy": unexpected, "environment": unexpected, "output": Path()},
     )
     with pytest.raises(ValueError, match=says) as refused:

@@ -235,7 +235,7 @@ def test_a_simulator_that_plays_single_instructions_refuses_a_chain(chain: Table
     nothing: Any = None
     deployment = SimulatorDeployment(
         **parts,
-        network=RosNetwork.named("loopback"),
+        network=RosNetwork("loopback", None, None),
         policy=nothing,
         environment=lambda: chain,
         output=tmp_path,

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
-import yaml
 from command_line import SMALL, here, vla
 from composing import composed
 from documented import TEXT
@@ -36,7 +35,7 @@ from vla.data.episodes import EpisodeStore
 from vla.deploy.loop import Loop
 from vla.deploy.messages import SimulatedEpisode
 from vla.deploy.operator import DemoOperator
-from vla.deploy.ros import NETWORKS, RosNetwork, split_arguments
+from vla.deploy.ros import RosNetwork, split_arguments
 from vla.io.errors import UserError
 from vla.jobs import deploy as job
 from vla.models.policy_folder import read_policy
@@ -75,7 +74,7 @@ class Probe:
     """Records joint states and commands, and sends instructions."""
 
     def __init__(self) -> None:
-        RosNetwork.named("loopback").apply()
+        RosNetwork("loopback", None, None).apply()
         self._context = Context()
         rclpy.init(context=self._context, domain_id=DOMAIN)
         self.node = rclpy.create_node("probe", context=self._context)
@@ -305,22 +304,13 @@ def test_a_policy_is_deployed_where_nothing_renders(monkeypatch: pytest.MonkeyPa
         backend.require_backend()
 
 
-def test_the_networks_have_their_options() -> None:
-    files = (Path(__file__).parents[1] / "conf/deploy/network").glob("*.yaml")
-    options = {file.stem: yaml.safe_load(file.read_text()) for file in files}
-    assert options.keys() == NETWORKS.keys()
-    for name, option in options.items():
-        del option["_target_"]
-        assert vars(RosNetwork(**option)) == vars(RosNetwork.named(name))
-
-
 def test_a_middleware_that_ignores_the_profile_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
     with pytest.raises(ValueError, match="rmw_cyclonedds_cpp, which ignores the profile"):
-        RosNetwork.named("loopback").apply()
-    RosNetwork.named("localhost").apply()
+        RosNetwork("loopback", None, None).apply()
+    RosNetwork("localhost", None, None).apply()
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
-    RosNetwork.named("loopback").apply()
+    RosNetwork("loopback", None, None).apply()
 
 
 def test_a_ros_installation_finds_the_node() -> None:

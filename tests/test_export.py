@@ -104,26 +104,6 @@ if __name__ == "__main__":  # worker processes import this file
 """
 
 
-RENDERED = """
-import hashlib, sys
-import conftest, numpy
-if sys.argv[1:]:
-    conftest.make_tabletop("task.image_size=[32,32]").reset(0)
-from backports import zstd
-steps = numpy.random.default_rng(0).normal(0, 3, 200_000)
-print(hashlib.md5(zstd.compress(numpy.clip(numpy.cumsum(steps), 0, 255).astype("uint8").tobytes())).hexdigest())
-"""
-
-
-def test_compressed_data_do_not_depend_on_what_was_rendered_before() -> None:
-    """Mesa brings a version of zstd of its own."""
-    environment, printed = {**os.environ, "PYTHONPATH": TESTS}, set()
-    for arguments in ((), ("render",)):
-        command = [sys.executable, "-c", RENDERED, *arguments]
-        printed.add(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
-    assert len(printed) == 1
-
-
 @pytest.mark.parametrize("name", ["files", "lerobot"])
 def test_killed_twice_at_random_an_export_goes_on_and_ends_up_the_same(name: str, tmp_path: Path) -> None:
     store = stored(tmp_path / "store", seeds=range(75))[0]  # 60 episodes, more than one video per camera

@@ -78,7 +78,7 @@ class World:
         dry_run: bool = False,
         robot: JointLimits = ROBOT,
     ) -> None:
-        RosNetwork.named("loopback").apply()
+        RosNetwork("loopback", None, None).apply()
         self.contexts = [Context(), Context()]
         for context, given in zip(self.contexts, (arguments, None), strict=True):
             rclpy.init(args=given, context=context, domain_id=domain)
@@ -88,7 +88,7 @@ class World:
         topics = {camera: f"/{camera}{'/compressed' if compressed else ''}" for camera in SPEC.cameras}
         self.settings = PolicyDeployment(
             robot=robot,
-            network=RosNetwork.named("loopback"),
+            network=RosNetwork("loopback", None, None),
             topics=replace(TOPICS, images=topics),
             safety=SAFETY,
             **defaults_of("deploy/ros2", command=command, gripper=gripper, dry_run=dry_run),

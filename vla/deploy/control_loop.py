@@ -248,9 +248,8 @@ class ControlLoop:
             self.stop(f"time-out: {self.safety.instruction:g} s on one instruction", "send the next instruction")
             self._timed_out = True
         elif problem := self._input_problem(newest, now):
-            self._observer.fresh = (
-                0  # a held arm moves again after frames in a row, not after three good ones in between
-            )
+            # A held arm moves again after frames in a row, not after some good ones in between.
+            self._observer.fresh = 0
             self._set_state(State.HOLDING if self.state is State.RUNNING else self.state, problem)
         elif self.state is State.WAITING or self._observer.fresh >= self.safety.fresh_frames:
             self._set_state(State.RUNNING, "")

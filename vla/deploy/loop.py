@@ -28,12 +28,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(kw_only=True)
 class Loop:
-    """Plays episodes over ROS and reports them as an evaluation would.
+    """Plays episodes over ROS, reports them as an evaluation would, and records all standard messages as a bag.
 
     Attributes:
         agent, simulator: factories of the two deployments, called with `policy`, `environment` and `output`.
         episodes: number of episodes.
-        record: write all standard messages as a bag.
         policy, environment: factories of the checkpoint's policy and of its task's environment.
         output: folder of the report and the recordings.
     """
@@ -43,7 +42,6 @@ class Loop:
     agent: Callable[..., PolicyDeployment]
     simulator: Callable[..., SimulatorDeployment]
     episodes: Count
-    record: bool
     policy: Callable[[], Policy]
     environment: Callable[[], Environment]
     output: Path
@@ -69,7 +67,7 @@ class Loop:
 
     @contextmanager
     def running(self) -> Iterator[DemoOperator]:
-        """Start both nodes, and the recorder if configured; yields the operator."""
+        """Start both nodes and the recorder; yields the operator."""
         arguments = {"policy": self.policy, "environment": self.environment, "output": self.output}
         agent, simulator = self.agent(**arguments), self.simulator(**arguments)
         if agent.command != "joint_state" or agent.dry_run:
@@ -89,8 +87,8 @@ class Loop:
                 node = create_node("vla_operator")
                 opened.callback(node.destroy_node)
                 operator = DemoOperator(node, agent.topics.instruction, stopped, *processes)
-                if self.record:  # to the end: an episode that fails is the one to look at
-                    opened.enter_context(closing(BagRecorder(node, self.output / "bag")))
+                # To the end: an episode that fails is the one to look at.
+                opened.enter_context(closing(BagRecorder(node, self.output / "bag")))
                 yield operator
         finally:
             for process in processes:

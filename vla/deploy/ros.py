@@ -38,32 +38,23 @@ def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 FAST_DDS = "rmw_fastrtps"  # first part of the names of its middleware
-Range = Literal["SYSTEM_DEFAULT", "LOCALHOST", "SUBNET", "OFF"]
-NETWORKS: dict[str, tuple[Range, str | None]] = {  # discovery range and profile of the options of `deploy/network`
-    "loopback": ("SYSTEM_DEFAULT", "loopback"),
-    "localhost": ("LOCALHOST", None),
-    "site": ("SUBNET", None),
-}
+Reach = Literal["loopback", "localhost", "site"]
+NETWORKS = {"loopback": "SYSTEM_DEFAULT", "localhost": "LOCALHOST", "site": "SUBNET"}  # → ROS_AUTOMATIC_DISCOVERY_RANGE
 
 
 @dataclass(frozen=True)
 class RosNetwork:
     """The part of the network that ROS communicates with."""
 
-    discovery: Range  # ROS_AUTOMATIC_DISCOVERY_RANGE
-    profile: str | None  # file with a Fast DDS profile; "loopback" is that of this package, for 127.0.0.1 only
+    reach: Reach  # 127.0.0.1 and shared memory, this machine, the local network
+    profile: str | None  # file with a Fast DDS profile; None: for `loopback` that of this package
     domain: Annotated[int, Ge(0), Le(MAX_DOMAIN)] | None  # ROS_DOMAIN_ID; None: that of the environment
-
-    @classmethod
-    def named(cls, name: str) -> RosNetwork:
-        """Return an option of `deploy/network`, for commands that do not compose a config."""
-        return cls(*NETWORKS[name], domain=None)
 
     def apply(self) -> None:
         """Set the environment variables that ROS reads at start; raise a UserError if ROS would not accept them."""
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = self.discovery
-        if self.profile is not None:
-            profile = LOOPBACK if self.profile == "loopback" else Path(self.profile)
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = NETWORKS[self.reach]
+        if self.profile or self.reach == "loopback":
+            profile = Path(self.profile or LOOPBACK)
             if not profile.is_file():
                 raise UserError(f"deploy.network.profile: there is no file {profile}")
             middleware = os.environ.get("RMW_IMPLEMENTATION") or FAST_DDS
@@ -132,12 +123,12 @@ def plain_errors() -> Iterator[None]:
 
 
 @contextmanager
-def command_node(name: str, network: str) -> Iterator[tuple[Any, Event]]:
+def command_node(name: str, network: Reach) -> Iterator[tuple[Any, Event]]:
     """Run a command as a ROS node on an option of `deploy/network`; user errors exit with one sentence.
 
     Yields the node, and the event of `ros`.
     """
-    with plain_errors(), ros(RosNetwork.named(network)) as stopped:
+    with plain_errors(), ros(RosNetwork(network, None, None)) as stopped:
         from rclpy import create_node
 
         node = create_node(name)

@@ -153,14 +153,6 @@ class Learner(LightningModule):
         done = (step - self._warmup) / max(total - self._warmup, 1)
         return 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
 
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        """Move everything but the instructions, which Lightning would search for tensors."""
-        if device.type == "cpu":
-            return batch  # it was made there
-        tensors = {name: value for name, value in batch.items() if name != "instruction"}
-        moved: Batch = super().transfer_batch_to_device(tensors, device, dataloader_idx)
-        return {**moved, "instruction": batch["instruction"]}
-
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
         """Apply the transforms of the model to a batch on its device."""
         return self.model.transforms(batch)

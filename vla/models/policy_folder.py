@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -25,6 +23,7 @@ from vla.io.types import Natural
 from vla.models.hub import HUB, fetch
 from vla.models.model import Model
 from vla.models.trunk import Source, require_trunks, whole_state
+from vla.models.trunk_folder import opened
 from vla.parallel.limits import free_memory, memory
 from vla.spec import Spec
 
@@ -76,7 +75,7 @@ class SavedPolicy:
         with path.open("rb") as file:
             if hashlib.file_digest(file, "sha256").hexdigest() != self.training.weights:
                 raise UserError(f"{path} is damaged, or not the file that {TRAINING} describes: copy the folder again")
-        with _opened(path) as weights:
+        with opened(path) as weights:
             names: list[str] = weights.keys()  # it is no mapping
             further = (weights.metadata() or {}).items()
             plain: dict[str, Any] = {name: parse_json(text, Any, name) for name, text in further}  # type: ignore[arg-type]
@@ -179,22 +178,10 @@ def read_policy(name: str | Path) -> SavedPolicy:
     present = [nodes[name] for name in (*REQUIRED_NODES, *OPTIONAL_NODES) if name in nodes]
     if not nodes.keys() >= {*REQUIRED_NODES} or not all(isinstance(node, dict) for node in present):
         raise UserError(f"{folder / CONFIG} is of no policy of this project: it lacks {', '.join(REQUIRED_NODES)}")
-    with _opened(_file(folder, WEIGHTS)):
+    with opened(_file(folder, WEIGHTS)):
         pass  # its header has the sizes of all weights, which are those of the file
     made = parse_plain(training, Training, str(folder / TRAINING))
     return SavedPolicy(folder, nodes, Spec.from_dict(spec, str(folder / SPEC)), made)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Open a file of weights, whose header is checked; a UserError if it is damaged."""
-    from safetensors import safe_open
-
-    try:
-        with safe_open(path, "pt") as file:
-            yield file
-    except Exception as error:  # safetensors has errors of its own
-        raise UserError(f"{path} is damaged: {lines_of(error)[0][:200]}") from error
 
 
 def _file(folder: Path, name: str) -> Path:

@@ -69,17 +69,14 @@ def evaluate_trunk(module: nn.Module) -> None:
 
 
 def require_trunks(model: nn.Module, named: Mapping[str, Source], policy: object) -> None:
-    """Require the trunks that a policy names; a module that does not load its own when it is built has `load_source`.
+    """Require the trunks that a policy names.
 
     Raises:
         UserError: one is not here, or is another one than in training.
     """
     modules: dict[str, Any] = dict(model.named_modules())
     for part, source in named.items():
-        module = modules.get(part)
-        if not hasattr(module, "source") and hasattr(module, "load_source"):
-            module.load_source(source)
-        if (found := getattr(module, "source", None)) is None or found.sha256 != source.sha256:
+        if (found := getattr(modules.get(part), "source", None)) is None or found.sha256 != source.sha256:
             here = f"here it is {found}" if found else "that is not here"
             raise UserError(f"{policy} was trained with {part} from {source}, and {here}: get that revision")
 

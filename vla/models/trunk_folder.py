@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from vla.io.documents import read_json
+from vla.io.documents import lines_of, read_json
 from vla.io.errors import UserError
 from vla.models.hub import HUB, fetch
 
@@ -35,6 +37,18 @@ def trunk_folder(name: str) -> Path:
             )
         return Path(name)
     return _fetched(name, *FILES)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """Open a safetensors file, whose header is checked; a UserError if it is damaged."""
+    from safetensors import safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            yield file
+    except Exception as error:  # safetensors has errors of its own
+        raise UserError(f"{path} is damaged: {lines_of(error)[0][:200]}") from error
 
 
 def _fetched(name: str, *patterns: str) -> Path:

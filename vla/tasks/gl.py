@@ -43,8 +43,6 @@ def choose_backend() -> None:
     with suppress(ImportError):
         import triton  # noqa: F401
     choose_device()
-    with suppress(ImportError):  # the system's library: after Mesa it would be Mesa's, and bags would have other bytes
-        import backports.zstd  # noqa: F401
     chosen = os.environ.get("MUJOCO_GL")
     known = chosen in (NO_BACKEND, os.environ.get(WORKING_BACKEND, NO_BACKEND))
     if known or os.environ.get("DISPLAY") or sys.platform != "linux":

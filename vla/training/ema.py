@@ -53,20 +53,15 @@ class EMA(Callback):
             # One fused kernel, which cannot mix plain and sharded tensors.
             torch._foreach_lerp_([*map(local_shard, self._average)], [*map(local_shard, current)], share)
 
-    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Swap in the average."""
-        self._swap(pl_module)
-
-    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Swap back the weights in training."""
-        self._swap(pl_module)
-
     @torch.no_grad()
-    def _swap(self, module: LightningModule) -> None:
-        for mine, other in zip(self._average, _averaged(module).values(), strict=False):
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Exchange the average and the weights in training."""
+        for mine, other in zip(self._average, _averaged(pl_module).values(), strict=False):
             average = mine.clone()
             mine.copy_(other)
             other.copy_(average)
+
+    on_validation_epoch_end = on_validation_epoch_start
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """Save the average as `state_dict` and the weights in training as `current_model_state`."""

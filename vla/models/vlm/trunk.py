@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from vla.io.documents import lines_of, read_json
+from vla.io.documents import read_json
 from vla.io.errors import UserError
 from vla.models.trunk import Source
-from vla.models.trunk_folder import CONFIG, WEIGHTS, trunk_folder
+from vla.models.trunk_folder import CONFIG, WEIGHTS, opened, trunk_folder
 from vla.models.vlm.network import FlowNetwork, renamed
 from vla.parallel.limits import memory
 
@@ -145,14 +144,8 @@ def _initialize(network: nn.Module, name: str, module: nn.Module) -> None:
 
 def _tensors(paths: list[Path]) -> Iterator[tuple[str, Tensor]]:
     """Yield name and tensor of all that the files have; a UserError if one is damaged."""
-    from safetensors import safe_open
-
-    with ExitStack() as stack:
-        for path in paths:
-            try:
-                file = stack.enter_context(safe_open(path, "pt"))
-            except Exception as error:  # safetensors has errors of its own
-                raise UserError(f"{path} is damaged: {lines_of(error)[0][:200]}") from error
+    for path in paths:
+        with opened(path) as file:
             names: list[str] = file.keys()  # it is no mapping
             for name in names:
                 yield name, file.get_tensor(name)

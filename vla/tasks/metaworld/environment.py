@@ -14,7 +14,7 @@ from vla.io.suggestion import suggestion
 from vla.io.types import ImageSize, Names, Natural, Share, Text
 from vla.spec import Array, Observation, Spec
 from vla.tasks.metaworld.package import tasks_of
-from vla.tasks.metaworld.scene import PictureSettings, TaskScene, parts_of
+from vla.tasks.metaworld.scene import TaskScene, parts_of
 from vla.tasks.rendering.renderer import RendererFactory
 from vla.tasks.world import Scenes, World
 
@@ -101,9 +101,7 @@ class MetaWorld(World):
             parts=tuple(parts_of(cameras, window, hand_size)),
         )
         self._sentences, self._steps = sentences, steps
-        size = self.spec.image_size
-        settings = PictureSettings(renderer, self.spec.cameras, size, self.spec.parts, drawn, shadows)
-        self._make_scene = partial(TaskScene, settings=settings)
+        self._make_scene = partial(TaskScene, spec=self.spec, renderer=renderer, drawn=drawn, shadows=shadows)
         self._scenes = Scenes[TaskScene]()
         self.tool: Array = np.zeros(3)
 

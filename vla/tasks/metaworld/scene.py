@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from vla.io.errors import UserError
 from vla.io.parts import Part, cut
-from vla.spec import Array
+from vla.spec import Array, Spec
 from vla.tasks.metaworld.package import simulator, stop_sliding
 from vla.tasks.rendering.renderer import LazyRenderer, RendererFactory, Views
 
@@ -26,26 +25,14 @@ ORIENTATION = (-0.39503823089303436, 0.26266733956017996, -0.4349370357280407, 0
 CURRENT, BEFORE = slice(18), slice(18, 36)  # of an observation (39,): hand, gripper, objects now and one step before
 
 
-@dataclass(frozen=True)
-class PictureSettings:
-    """What pictures of all tasks have in common."""
-
-    renderer: RendererFactory
-    cameras: tuple[str, ...]  # names in the model, or HAND
-    image_size: tuple[int, int]  # height and width of the pictures [px]
-    parts: tuple[Part, ...]  # what cameras show of LeRobot's picture
-    drawn: int | None  # this and what follows: see `MetaWorld`
-    shadows: int
-
-
 class TaskScene:
     """Simulator of a task with the cameras as LeRobot has them; its renderer is made with the first picture."""
 
-    def __init__(self, task: str, settings: PictureSettings) -> None:
-        """Compile a task; a UserError if it lacks a camera."""
-        self._settings, self.simulator = settings, simulator(task)
-        model, cameras = self.simulator.model, settings.cameras
-        self.model = model
+    def __init__(self, task: str, spec: Spec, renderer: RendererFactory, drawn: int | None, shadows: int) -> None:
+        """Compile a task; a UserError if it lacks a camera. For `drawn` and `shadows` see `MetaWorld`."""
+        self.simulator, self._size, self._drawn = simulator(task), spec.image_size, drawn
+        self.model = model = self.simulator.model
+        cameras = spec.cameras
         known = [model.camera(number).name for number in range(model.ncam)]
         if unknown := [name for name in cameras if name not in (*known, HAND)]:
             raise UserError(
@@ -55,16 +42,16 @@ class TaskScene:
         camera = known.index(CAMERA)
         model.cam_pos[camera] = CAMERA_PLACE
         model.cam_quat[camera] = _turned()
-        model.vis.quality.shadowsize = settings.shadows
+        model.vis.quality.shadowsize = shadows
         model.mat_reflectance[:] = 0  # of the renderers none draws it, and in no task does it show from corner2
-        shown = {part.camera: part for part in settings.parts}
+        shown = {part.camera: part for part in spec.parts}
         self._parts = [shown.get(name, Part(name)) for name in cameras]
         self._places = [known.index(CAMERA if name == HAND else name) for name in cameras]
         # All of a camera's picture is drawn once.
-        seen = self._places if settings.drawn is None else sorted(set(self._places))
-        height, width = settings.image_size if settings.drawn is None else (settings.drawn, settings.drawn)
+        seen = self._places if drawn is None else sorted(set(self._places))
+        height, width = self._size if drawn is None else (drawn, drawn)
         self._views = Views(seen, height, width, site_groups=(0, 1, 2), aspect=1.0)
-        self._renderer = LazyRenderer(settings.renderer, self.model, self._views)
+        self._renderer = LazyRenderer(renderer, self.model, self._views)
 
     def reset(self, seed: int) -> Array:
         """Draw object and goal, and return the observation (39,): hand, gripper, objects, the same one step before,
@@ -92,11 +79,11 @@ class TaskScene:
         """Draw every camera's picture (cameras, H, W, 3) uint8."""
         hand = self.simulator.get_endeff_pos()
         windows = np.array([part.at(hand) for part in self._parts])
-        if self._settings.drawn is None:
+        if self._drawn is None:
             return self._renderer.render(self.simulator.data, windows)[0]
         pictures = dict(zip(self._views.cameras, self._renderer.render(self.simulator.data)[0], strict=True))
         shown = zip(self._places, windows, strict=True)
-        return np.stack([cut(pictures[camera], window, self._settings.image_size) for camera, window in shown])
+        return np.stack([cut(pictures[camera], window, self._size) for camera, window in shown])
 
     def close(self) -> None:
         """Free physics and GL."""

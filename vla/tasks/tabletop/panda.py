@@ -18,9 +18,9 @@ from vla.tasks.tabletop.robot import (
     HIDDEN,
     ROBOT_CONTACT,
     VISIBLE,
-    CameraPose,
     TabletopRobot,
     attributes,
+    camera,
     spread,
 )
 
@@ -48,7 +48,7 @@ GRIP_FORCE = 20.0  # of both fingers together [N]; the Franka Hand gives up to 7
 
 SHELL = (0.93, 0.94, 0.95, 1.0)
 DARK = (0.22, 0.23, 0.25, 1.0)
-WRIST = CameraPose(position=(0.085, 0.0, 0.035), target=(0.02, 0.0, 0.12), fovy=75.0)  # in the hand's frame
+WRIST = camera((0.085, 0.0, 0.035), (0.02, 0.0, 0.12), fovy=75.0, up=(1, 0, 0))  # in the hand's frame
 JOINTS = tuple(f"panda_joint{index}" for index in range(1, 8))
 ARM = RobotModel(
     joints=JOINTS,
@@ -132,7 +132,7 @@ def _mjcf(meshes: str) -> str:
         <inertial mass="{HAND_MASS}" pos="-0.01 0 0.03" diaginertia="0.001 0.0025 0.0017"/>
         {_geoms("hand", SHELL)}
         <site name="tcp" size="0.004" group="4" {attributes(pos=(0, 0, panda.HAND_TO_TCP))}/>
-        <camera name="wrist" {WRIST.mjcf((1, 0, 0))}/>
+        <camera name="wrist" {WRIST}/>
         {_finger("left", 0.0)}
         {_finger("right", np.pi)}
       </body>{"</body>" * len(LINKS)}

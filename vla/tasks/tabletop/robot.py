@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -42,18 +41,10 @@ def _text(value: ArrayLike) -> str:
     return " ".join(f"{number:.17g}" for number in np.ravel(value).tolist())
 
 
-@dataclass(frozen=True)
-class CameraPose:
-    """A camera that looks from `position` at `target`, with a vertical field of view."""
-
-    position: tuple[float, float, float]  # [m]
-    target: tuple[float, float, float]  # [m]
-    fovy: float  # [degrees]
-
-    def mjcf(self, up: tuple[int, int, int]) -> str:
-        """Return the attributes of the camera in MJCF; `up` is a direction to the upper edge of its pictures."""
-        axes = look_at(self.position, self.target, up)
-        return attributes(pos=self.position, xyaxes=axes[:, :2].T, fovy=self.fovy)
+def camera(position: Sequence[float], target: Sequence[float], fovy: float, up: Sequence[float]) -> str:
+    """Return the attributes in MJCF of a camera at `position` that looks at `target` [m], with a vertical field of view
+    [degrees]; `up` is a direction to the upper edge of its pictures."""
+    return attributes(pos=position, xyaxes=look_at(position, target, up)[:, :2].T, fovy=fovy)
 
 
 def look_at(position: Sequence[float] | Array, target: Sequence[float] | Array, up: Sequence[float] | Array) -> Array:

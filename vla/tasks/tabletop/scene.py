@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from dm_control import mjcf
 
-from vla.tasks.tabletop.robot import PHYSICS, VISIBLE, CameraPose, TabletopRobot, attributes
+from vla.tasks.tabletop.robot import PHYSICS, VISIBLE, TabletopRobot, attributes, camera
 from vla.tasks.tabletop.robot_file import compiled
 
 COLOURS: dict[str, tuple[float, float, float]] = {
@@ -32,7 +32,7 @@ SHADOWED = (0.42, 0.0, 0.1)  # centre of the shadow region [m]
 SHADOW_REACH = 0.6  # radius of the shadow region [m]
 TEXTURE = 64  # edge of the table's and the floor's texture [px]
 FRICTION = (1.0, 0.01, 0.0002)  # nominal, of table and blocks
-FRONT = CameraPose(position=(1.02, 0.0, 0.52), target=(0.5, 0.0, 0.05), fovy=45.0)  # in the base frame
+FRONT = camera((1.02, 0.0, 0.52), (0.5, 0.0, 0.05), fovy=45.0, up=(0, 0, 1))  # in the base frame
 
 
 def compile_scene(robot: TabletopRobot, blocks: int, shadows: bool) -> mujoco.MjModel:
@@ -98,6 +98,6 @@ def _surroundings(shadows: bool) -> str:
           group="{VISIBLE}"/>
     {pads}
     <light name="lamp" type="directional" diffuse="0.55 0.55 0.55" specular="0.15 0.15 0.15" {lamp}/>
-    <camera name="front" {FRONT.mjcf((0, 0, 1))}/>
+    <camera name="front" {FRONT}/>
   </worldbody>
 </mujoco>"""
