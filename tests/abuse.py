@@ -23,7 +23,7 @@ from abuse_files import bags, datasets, runs
 from abuse_kills import kills
 from abuse_messages import messages
 from crafted import hiding, listener, save
-from hostile import hostile
+from hostile import hostile, put
 from saved_policies import save_run
 from trials import CHECKPOINT, EVALUATE, TRAIN, Trials, last, run
 
@@ -234,14 +234,6 @@ def no_room() -> None:
     """Let writes beyond 20 kB fail, without the signal that would end the process."""
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-
-
-def put(config: dict[str, Any], key: str, value: Any) -> None:
-    """Set what stands at a key with dots."""
-    *parents, name = key.split(".")
-    for parent in parents:
-        config = config[parent]
-    config[name] = value
 
 
 SECTIONS = {section.__name__: section for section in (

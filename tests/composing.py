@@ -50,3 +50,9 @@ def _is_value(override: str) -> bool:
 @cache
 def _composed_once(overrides: tuple[str, ...]) -> DictConfig:
     return compose("output=outputs/runs/now", *overrides)
+
+
+def run_job(config: DictConfig) -> None:
+    """Check and run a job as the command line does."""
+    check(config)
+    jobs.run(Experiment.of(config))

@@ -20,6 +20,14 @@ def command(mark: Path) -> dict[str, Any]:
     return {"_target_": HANDLER, "entrypoint": "/bin/sh", **arguments, "numa_options": None}
 
 
+def put(config: dict[str, Any], key: str, value: Any) -> None:
+    """Set what stands at a key with dots."""
+    *parents, name = key.split(".")
+    for parent in parents:
+        config = config[parent]
+    config[name] = value
+
+
 def node(target: str, **arguments: Any) -> dict[str, Any]:
     return {"_target_": target, **arguments}
 

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from collecting import content
 from toy import ARM_SPEC
-from toy_episodes import CODECS, CONFIG, EPISODES, add, content, full_disk
+from toy_episodes import CODECS, CONFIG, EPISODES, add, full_disk
 
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
+from collecting import content
 from composing import composed
 from exporting import exporter
+from resuming import same
 from toy import ARM_SPEC, make_arm, make_environment, make_expert
-from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, content
+from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change
 
 from vla.config.check import check
 from vla.config.experiment import Experiment
@@ -31,13 +31,6 @@ from vla.rollouts.memorisation import NearestDemonstration
 
 RAW, LOSSLESS, JPEG = CODECS
 LATER = 1  # an episode after the first
-
-
-def same(one: Any, other: Any) -> bool:
-    """Whether two batches are equal, bit for bit."""
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(one[name], other[name]) for name in one)
-    return torch.equal(one, other) if isinstance(one, torch.Tensor) else bool(one == other)
 
 
 def of_all(store: EpisodeStore, field: str) -> list[np.ndarray]:

@@ -7,25 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from composing import check, composed
+from composing import composed, run_job
 from crafted import hidden, hiding, listener, save
-from omegaconf import DictConfig
 from saved_policies import save_run
 
-from vla import jobs
 from vla.config.adopt import adopt, finetune
-from vla.config.experiment import Experiment, make_policy, plain
+from vla.config.experiment import make_policy, plain
 from vla.models.checkpoint import read_header
 from vla.runs.resume import training_progress
 
 ATTACKS = list(hiding(plain(composed("expert=waypoint")), Path(), 0))
 SECRET = "hunter2secret"
-
-
-def run_job(cfg: DictConfig) -> None:
-    """Check and run a job as the command line does."""
-    check(cfg)
-    jobs.run(Experiment.of(cfg))
 
 
 @pytest.mark.parametrize("attack", ATTACKS)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from huggingface_hub import constants
 
+from vla.io.errors import UserError
 from vla.models.hub import fetch
 
 FILES = {"config.json": b"{}", "model.safetensors": b"weights", "pytorch_model.bin": b"pickle"}
@@ -84,7 +85,7 @@ def test_what_matches_is_downloaded_once_and_is_there_without_the_hub(
 
 def test_a_model_that_the_hub_has_not_is_named(downloads: list[str]) -> None:
     for name in ("nobody/model", "no/name/at/all"):
-        with pytest.raises(OSError, match=f"it has no public model {name}"):
+        with pytest.raises(UserError, match=f"it has no public model {name}"):
             fetch(name, "*")
 
 
@@ -92,7 +93,7 @@ def test_without_the_hub_the_reason_is_one_line(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
     monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
     for reason in ("refused", "OFFLINE"):
-        with pytest.raises(OSError, match=reason) as caught:
+        with pytest.raises(UserError, match=reason) as caught:
             fetch("somebody/model", "*")
         assert "\n" not in str(caught.value)
         monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)

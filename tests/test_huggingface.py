@@ -171,7 +171,7 @@ def test_what_is_no_encoder_is_told_in_one_line(change: Callable[[Path], object]
 def test_without_folder_and_hub_the_name_is_named(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(UserError, match=f"model.text.name={name} is no folder here, and cannot be fetched"):
+    with pytest.raises(UserError, match=f"{name} cannot be fetched .*; nor is it a folder here: give model.text"):
         HuggingFace(name, width=8)
 
 

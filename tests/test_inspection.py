@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from collecting import content
 from command_line import here
 from toy import ARM_SPEC, make_arm, make_environment, make_expert
-from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, content, flip
+from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, flip
 
 from vla.config.nodes import Inspection
 from vla.data.derivation import derive_store

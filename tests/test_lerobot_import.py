@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from collecting import content
 from defaults import defaults_of
 from exporting import exporter, stored
 from lerobot_files import (
@@ -38,7 +39,6 @@ from lerobot_files import (
 )
 from PIL import Image
 from toy import ARM, ARM_SPEC, make_arm
-from toy_episodes import content
 
 from vla.config.experiment import make_agent
 from vla.data.datamodule import held_out

@@ -11,16 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from composing import CONF, check, composed
-from hostile import HANDLER, hostile, node
-from omegaconf import DictConfig
+from composing import CONF, composed, run_job
+from hostile import HANDLER, hostile, node, put
 from saved_policies import change_json, save_policy, save_run
 from toy_episodes import EPISODES, add
 
-from vla import jobs
 from vla.config.adopt import adopt, finetune, resume
 from vla.config.annotations import LIBRARY, OWN, locate
-from vla.config.experiment import Experiment, make_policy, plain
+from vla.config.experiment import make_policy, plain
 from vla.io.errors import UserError
 
 # Everything under these could be named once, and some of it acts when it is built.
@@ -54,20 +52,6 @@ def test_the_library_classes_that_may_be_built_are_those_of_the_options() -> Non
 
 ATTACKS = list(hostile(Path()))
 REFUSED = r"_target_ must name a class|holds the reference '.*only resolved values are read from files"
-
-
-def put(config: dict[str, Any], key: str, value: Any) -> None:
-    """Set what stands at a key with dots."""
-    *parents, name = key.split(".")
-    for parent in parents:
-        config = config[parent]
-    config[name] = value
-
-
-def run_job(cfg: DictConfig) -> None:
-    """Check and run a job as the command line does."""
-    check(cfg)
-    jobs.run(Experiment.of(cfg))
 
 
 @pytest.fixture(scope="module")

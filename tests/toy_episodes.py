@@ -33,10 +33,6 @@ def add(folder: Path, episodes: list[Episode], codec: Codec | None = None) -> Ep
     return store
 
 
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "lock"}
-
-
 MORE = [*EPISODES, *(rollout(make_arm(), ToyExpert(), seed) for seed in range(5, 9))]  # seeds 3 and 8 fail
 
 

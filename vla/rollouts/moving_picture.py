@@ -33,13 +33,7 @@ def save_moving_picture(episode: Episode, path: Path) -> None:
 
 
 def _frame(seen: Observation) -> Image.Image:
-    """Return the images (H, W, 3) of all cameras side by side, at the height of the first, at most `HEIGHT`."""
-    images = [Image.fromarray(np.asarray(image)) for image in seen.rgb.values()]
-    height = min(images[0].height, HEIGHT)
-    scaled = [image.resize((round(image.width * height / image.height), height)) for image in images]
-    frame = Image.new("RGB", (sum(image.width for image in scaled), height))
-    left = 0
-    for image in scaled:
-        frame.paste(image, (left, 0))
-        left += image.width
+    """Return the images (H, W, 3) of all cameras side by side, at most `HEIGHT` high."""
+    frame = Image.fromarray(np.concatenate([*seen.rgb.values()], axis=1))
+    frame.thumbnail((frame.width, HEIGHT))
     return frame

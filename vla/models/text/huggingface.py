@@ -156,15 +156,11 @@ def _folder(name: str | PackagedFile) -> Iterator[Path]:
     elif Path(name).is_dir():
         yield Path(name)
     else:
-        try:
-            fetched = fetch(name, *FILES)
-        except OSError as error:
-            raise UserError(
-                f"model.text.name={name} is no folder here, and cannot be fetched from the Hugging Face hub ({error}): "
-                "give the folder of a downloaded encoder, of a policy in its config.json, or train with the one in a "
-                "Python package, model/text=minilm"
-            ) from error
-        yield fetched
+        advice = (
+            "nor is it a folder here: give model.text.name, of a policy in its config.json, that of a download, "
+            "or train with model/text=minilm, which is in a Python package"
+        )
+        yield fetch(name, *FILES, advice=advice)
 
 
 def _network(folder: Path) -> tuple[Any, str | None]:

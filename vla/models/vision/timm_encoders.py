@@ -189,15 +189,13 @@ def _weights_file(name: str, repository: str | None, pretrained: Pretrained) -> 
                 f"model.image.pretrained is true, false, auto or a weights file, and there is no file {pretrained}"
             )
         return Path(pretrained)
+    advice = "model.image.pretrained may also be the path of a weights file, or false to start at random"
     try:
-        return fetch(repository or f"timm/{name}", WEIGHTS) / WEIGHTS
-    except OSError as error:
+        return fetch(repository or f"timm/{name}", WEIGHTS, advice=advice) / WEIGHTS
+    except UserError as error:
         if pretrained is True:
-            raise UserError(
-                f"the weights of {name} cannot be fetched ({error}): give model.image.pretrained the path of a weights "
-                "file, or false to start at random"
-            ) from error
-        log.warning("%s starts at RANDOM: its weights cannot be fetched (%s)", name, error)
+            raise
+        log.warning("%s starts at RANDOM: %s", name, error)
         return None
 
 

@@ -27,6 +27,29 @@ class Prefix(NamedTuple):
     present: Tensor  # (B, P) bool, false for padding
 
 
+class Own:
+    """Keys and values of the tokens of a layer, which attend to others before them too.
+
+    It is where transformers has a cache, and adds to none: a prefix stays as it is.
+
+    Args:
+        others: keys and values, (B, heads, P, width of a head) each.
+    """
+
+    keys: Tensor
+    values: Tensor
+
+    def __init__(self, others: tuple[Tensor, Tensor] | None = None) -> None:
+        self._others = others
+
+    def update(self, keys: Tensor, values: Tensor, layer: int) -> tuple[Tensor, Tensor]:
+        """Keep (B, heads, N, width of a head) keys and values, and return all that are seen."""
+        self.keys, self.values = keys, values
+        if self._others is None:
+            return keys, values
+        return torch.cat([self._others[0], keys], 2), torch.cat([self._others[1], values], 2)
+
+
 class FlowNetwork(nn.Module, ABC):
     """A pretrained trunk with an expert that predicts the velocity of noisy actions.
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from transformers import GemmaConfig, GemmaModel, PaliGemmaConfig, PaliGemmaModel, SiglipVisionConfig
 
 from vla.io.types import Count, Layers, Width
-from vla.models.vlm.network import FlowNetwork, Prefix, require_multiple, sizes
+from vla.models.vlm.network import FlowNetwork, Own, Prefix, require_multiple, sizes
 
 NAMES = (  # of weights, published and here
     ("paligemma_with_expert.paligemma.lm_head.", "paligemma.language_model.embed_tokens."),  # one matrix is both
@@ -127,29 +127,6 @@ class PaliGemmaWithExpert(FlowNetwork):
             keys.append(own.keys)
             values.append(own.values)
         return hidden, Prefix(tuple(keys), tuple(values), present)
-
-
-class Own:
-    """Keys and values of the tokens of a layer, which attend to others before them too.
-
-    It is where transformers has a cache, and adds to none: a prefix stays as it is.
-
-    Args:
-        others: keys and values, (B, 1, P, H) each.
-    """
-
-    keys: Tensor
-    values: Tensor
-
-    def __init__(self, others: tuple[Tensor, Tensor] | None = None) -> None:
-        self._others = others
-
-    def update(self, keys: Tensor, values: Tensor, layer: int) -> tuple[Tensor, Tensor]:
-        """Keep (B, 1, N, H) keys and values, and return all that are seen."""
-        self.keys, self.values = keys, values
-        if self._others is None:
-            return keys, values
-        return torch.cat([self._others[0], keys], 2), torch.cat([self._others[1], values], 2)
 
 
 def _trunk(text: dict[str, Any], vision: dict[str, Any]) -> PaliGemmaModel:

@@ -115,16 +115,8 @@ def _tokenizer(name: str) -> tuple[Any, str]:
     """Return the tokenizer in a folder or on the hub, and the SHA-256 of its file."""
     from tokenizers import Tokenizer
 
-    folder = Path(name)
-    if not folder.is_dir():
-        try:
-            folder = fetch(name, FILE)
-        except OSError as error:
-            raise UserError(
-                f"model.text.name={name} is no folder here, and cannot be fetched from the Hugging Face hub ({error}): "
-                f"give a folder with its {FILE}"
-            ) from error
-    path = folder / FILE
+    advice = f"nor is it a folder here: give model.text.name one with its {FILE}"
+    path = (Path(name) if Path(name).is_dir() else fetch(name, FILE, advice=advice)) / FILE
     try:
         content = path.read_bytes()
         tokenizer = Tokenizer.from_buffer(content)

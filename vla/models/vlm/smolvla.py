@@ -18,7 +18,7 @@ from transformers import LlamaConfig, LlamaModel, SmolVLMConfig, SmolVLMModel
 from transformers.models.llama.modeling_llama import LlamaAttention, apply_rotary_pos_emb
 
 from vla.io.types import Count, Layers, Width
-from vla.models.vlm.network import FlowNetwork, Prefix, require_multiple, sizes, with_time
+from vla.models.vlm.network import FlowNetwork, Own, Prefix, require_multiple, sizes, with_time
 
 ROPE_BASE = 10_000.0  # of the policy, whatever that of the language model was
 EPSILON = 1e-5  # of RMS norms
@@ -120,11 +120,11 @@ class SmolVLA(FlowNetwork):
         present = torch.cat([present, sentence, sentence.new_ones(len(sentence), 1)], 1)  # (B, P)
         mask = present[:, None, None, :].repeat(1, 1, present.shape[1], 1)  # (B, 1, P, P)
         mask[:, :, :-1, -1] = False  # only the state sees the state
-        rotation, kept = rotation_of(present.cumsum(1) - 1, self.head_width), Kept()
-        for layer in self.vlm.text_model.layers:
-            hidden = layer(hidden, attention_mask=mask, position_embeddings=rotation, past_key_values=kept)
-        read_by = [layer.self_attn for layer in self.expert.layers]
-        pairs = [attention.read(*pair) for attention, pair in zip(read_by, kept.pairs, strict=True)]
+        rotation, pairs = rotation_of(present.cumsum(1) - 1, self.head_width), []
+        for layer, expert in zip(self.vlm.text_model.layers, self.expert.layers, strict=True):
+            own = Own()
+            hidden = layer(hidden, attention_mask=mask, position_embeddings=rotation, past_key_values=own)
+            pairs.append(expert.self_attn.read(own.keys, own.values))
         return Prefix(tuple(keys for keys, _ in pairs), tuple(values for _, values in pairs), present)
 
     def velocity(self, prefix: Prefix, noisy: Tensor, time: Tensor) -> Tensor:
@@ -179,18 +179,6 @@ class ExpertAttention(LlamaAttention):
 
     def _by_head(self, features: Tensor) -> Tensor:
         return features.unflatten(-1, (-1, self.head_dim)).transpose(1, 2)
-
-
-class Kept:
-    """Keys and values of every layer, where transformers has a cache."""
-
-    def __init__(self) -> None:
-        self.pairs: list[tuple[Tensor, Tensor]] = []
-
-    def update(self, keys: Tensor, values: Tensor, layer: int) -> tuple[Tensor, Tensor]:
-        """Keep those of the next layer."""
-        self.pairs.append((keys, values))
-        return keys, values
 
 
 def _trunk(text: dict[str, Any], vision: dict[str, Any], shuffle: int) -> SmolVLMModel:
