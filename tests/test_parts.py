@@ -155,7 +155,7 @@ def wrong_weights(folder: Path) -> list[str]:
     ("prepare", "message"),
     [
         (unknown_name, "did you mean vit_small_patch16_dinov3"),
-        (no_folder, "/nowhere/at/all is no folder"),
+        (no_folder, "/nowhere/at/all cannot be fetched"),
         (wrong_weights, "does not hold the weights of timm's test_vit"),
     ],
 )
