@@ -48,7 +48,7 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         images: camera → key of its images; None: `observation.images.CAMERA`.
         state, action: keys of the features that hold the components, which are found by name.
         every: keep every n-th frame with the last of n actions, which suits absolute actions only.
-        scale: action component → factor on the dataset's actions; None: 1.
+        scale: action component → factor on the dataset's actions, also the executed ones; None: 1.
         control_hz: rate of the frames [Hz]; None: as the dataset says.
         in_order: the components of state and action are those of the task in its order, whatever their names.
         spec: of the task.
@@ -84,7 +84,9 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         if all(name in self._action for name in spec.action):
             read = [*state, *action, *rates, *executed]
             self._numbers = dataset.read(list(dict.fromkeys(read)))
-            self._actions = self._columns(spec.action, self._action, slice(None)) * _factors(scale, spec.action)
+            factors = _factors(scale, spec.action)
+            self._actions = self._columns(spec.action, self._action, slice(None)) * factors
+            self._numbers |= {key: self._numbers[key] * factors for key in executed}
             differences += imported.out_of_bounds(self._actions, spec, MAX_OUTSIDE)
         if differences:
             raise UserError(f"{dataset.folder} does not match the task: {'; '.join(differences)}")
