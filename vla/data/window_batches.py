@@ -46,7 +46,7 @@ class BufferPool:
     def empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Array:
         """Return an array with arbitrary content.
 
-        It is torch's, as those of NumPy start beside a cache line, to which some processors copy half as fast.
+        Torch allocates it, at a cache line; NumPy's arrays start beside one, where some processors copy half as fast.
         """
         length, *rest = shape
         arrays = self._arrays.setdefault((*rest, dtype), [])
