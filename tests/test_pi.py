@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import pytest
 import torch
+from defaults import defaults_of
 from tiny_pi import KINDS, STEPS, inputs, make_network
-from tiny_vla import deviation, reference
+from tiny_vla import SMOLVLA, deviation, reference
+from tiny_vla import inputs as of_smolvla
 from torch import Tensor
 
+from vla.models.lora import LoRA
 from vla.models.vlm.network import FlowNetwork, Prefix
+from vla.models.vlm.smolvla import SmolVLA
 
 TOLERANCE = 1e-5
 each = pytest.mark.parametrize("name", KINDS)
@@ -74,9 +78,13 @@ def test_a_time_per_action_is_that_of_the_action(name: str) -> None:
         assert not torch.allclose(network.velocity(prefix, given["noise"], times), together)
 
 
-@each
-def test_all_that_is_trained_has_a_gradient(name: str) -> None:
+@pytest.mark.parametrize("modules", [(), ("q_proj", "v_proj")])
+@pytest.mark.parametrize("name", [*KINDS, "smolvla"])
+def test_all_that_is_trained_has_a_gradient(name: str, modules: tuple[str, ...]) -> None:
     """Otherwise processes of a training would wait for those of some weights."""
-    network, given = make_network(name), inputs()
+    smolvla = SmolVLA(**SMOLVLA)
+    network, given = (smolvla, of_smolvla(SMOLVLA)) if name == "smolvla" else (make_network(name), inputs())
+    if modules:
+        LoRA(**defaults_of("learner/lora/low_rank", modules=modules)).inject(network)
     network.velocity(encoded(network, given), given["noise"], given["time"]).square().sum().backward()
     assert [name for name, weight in network.named_parameters() if weight.requires_grad and weight.grad is None] == []

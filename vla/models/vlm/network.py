@@ -13,10 +13,13 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from transformers.models.llama.modeling_llama import apply_rotary_pos_emb
 
 from vla.io.errors import UserError
 
 MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the embedding of a time
+
+Rotation = tuple[Tensor, Tensor]  # cosines and sines of positions, (B, N, H) each
 
 
 class Prefix(NamedTuple):
@@ -48,6 +51,50 @@ class Own:
         if self._others is None:
             return keys, values
         return torch.cat([self._others[0], keys], 2), torch.cat([self._others[1], values], 2)
+
+
+class LastLayer(nn.Module):
+    """The last layer of a trunk, from which actions see keys and values; what else it would compute, nobody sees.
+
+    Args:
+        layer: of Llama or Gemma, as transformers has them, whose parts it takes.
+    """
+
+    def __init__(self, layer: Any) -> None:
+        super().__init__()
+        self.input_layernorm, self.self_attn = layer.input_layernorm, layer.self_attn
+        self.self_attn.q_proj, self.self_attn.o_proj = Unused(layer.self_attn.q_proj), Unused(layer.self_attn.o_proj)
+        self.post_attention_layernorm, self.mlp = Unused(layer.post_attention_layernorm), Unused(layer.mlp)
+
+    def forward(self, hidden: Tensor, position_embeddings: Rotation, past_key_values: Own, **_: Any) -> Tensor:
+        """Leave keys and values of (B, N, E) tokens in `past_key_values`, and return the tokens as they are."""
+        normed, attention = self.input_layernorm(hidden), self.self_attn
+        keys, values = (
+            project(normed).unflatten(-1, (-1, attention.head_dim)).transpose(1, 2)
+            for project in (attention.k_proj, attention.v_proj)
+        )
+        past_key_values.update(apply_rotary_pos_emb(keys, keys, *position_embeddings)[1], values, attention.layer_idx)
+        return hidden
+
+
+class Unused(nn.Module):
+    """Weights of a published policy that no action depends on, under their names and without gradients.
+
+    Args:
+        module: whose weights they are.
+    """
+
+    def __init__(self, module: nn.Module) -> None:
+        super().__init__()
+        for name, weight in module.named_parameters(recurse=False):
+            self.register_parameter(name, nn.Parameter(weight.data, requires_grad=False))
+        for name, child in module.named_children():
+            self.add_module(name, Unused(child))
+
+
+def shorten(trunk: Any) -> None:
+    """Let a Llama or Gemma of transformers end, in place, with the keys and values of its last layer."""
+    trunk.layers[-1], trunk.norm = LastLayer(trunk.layers[-1]), Unused(trunk.norm)
 
 
 class FlowNetwork(nn.Module, ABC):

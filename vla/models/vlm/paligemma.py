@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from transformers import GemmaConfig, GemmaModel, PaliGemmaConfig, PaliGemmaModel, SiglipVisionConfig
 
 from vla.io.types import Count, Layers, Width
-from vla.models.vlm.network import FlowNetwork, Own, Prefix, require_multiple, sizes
+from vla.models.vlm.network import FlowNetwork, Own, Prefix, require_multiple, shorten, sizes
 
 NAMES = (  # of weights, published and here
     ("paligemma_with_expert.paligemma.lm_head.", "paligemma.language_model.embed_tokens."),  # one matrix is both
@@ -130,17 +130,13 @@ class PaliGemmaWithExpert(FlowNetwork):
 
 
 def _trunk(text: dict[str, Any], vision: dict[str, Any]) -> PaliGemmaModel:
-    """Build vision_tower, multi_modal_projector and language_model, without gradients of what no action depends on."""
+    """Build vision_tower, multi_modal_projector and language_model."""
     encoder = SiglipVisionConfig(**vision, vision_use_head=False)
     width = text["hidden_size"]
     trunk = PaliGemmaModel(
         PaliGemmaConfig(vision_config=encoder, text_config=GemmaConfig(**text), projection_dim=width)
     )
-    # Actions see the keys and values of the last layer, and nothing that is made with them.
-    last = trunk.language_model.layers[-1]
-    for idle in (last.self_attn.q_proj, last.self_attn.o_proj, last.post_attention_layernorm, last.mlp):
-        idle.requires_grad_(False)
-    trunk.language_model.norm.requires_grad_(False)
+    shorten(trunk.language_model)
     return trunk
 
 

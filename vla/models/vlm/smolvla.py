@@ -18,13 +18,11 @@ from transformers import LlamaConfig, LlamaModel, SmolVLMConfig, SmolVLMModel
 from transformers.models.llama.modeling_llama import LlamaAttention, apply_rotary_pos_emb
 
 from vla.io.types import Count, Layers, Width
-from vla.models.vlm.network import FlowNetwork, Own, Prefix, require_multiple, sizes, with_time
+from vla.models.vlm.network import FlowNetwork, Own, Prefix, Rotation, require_multiple, shorten, sizes, with_time
 
 ROPE_BASE = 10_000.0  # of the policy, whatever that of the language model was
 EPSILON = 1e-5  # of RMS norms
 NO_TOKENS: dict[str, None] = {"bos_token_id": None, "eos_token_id": None}  # nothing is generated
-
-Rotation = tuple[Tensor, Tensor]  # cosines and sines of positions, (B, N, H) each
 
 
 class SmolVLA(FlowNetwork):
@@ -184,7 +182,9 @@ class ExpertAttention(LlamaAttention):
 def _trunk(text: dict[str, Any], vision: dict[str, Any], shuffle: int) -> SmolVLMModel:
     """Build vision_model, connector and text_model."""
     config = SmolVLMConfig(text_config={"model_type": "llama", **text}, vision_config=vision, scale_factor=shuffle)
-    return SmolVLMModel(config)
+    trunk = SmolVLMModel(config)
+    shorten(trunk.text_model)
+    return trunk
 
 
 def _expert(shared: dict[str, Any], joint_every: int, width: int, feedforward: int) -> LlamaModel:
