@@ -181,6 +181,17 @@ def test_linear_maps_in_another_layout_compute_the_same_and_follow_their_weights
     assert deviation(*changed) > 1e-4
 
 
+def test_training_and_planning_compile_as_one_graph_each() -> None:
+    model = make_smolvla()
+    batch = with_text(model, make_batch(1, CHUNK, spec=SPEC))
+    with torch.inference_mode():
+        compiled = torch.compile(model.predict, backend="eager", fullgraph=True)
+        assert deviation(compiled(batch).actions, model.predict(batch).actions) < 1e-5
+    batch = model.noised(batch)
+    compiled = torch.compile(model.train().loss, backend="eager", fullgraph=True)
+    assert deviation(compiled(batch)["loss"].detach(), model.loss(batch)["loss"].detach()) < 1e-5
+
+
 def written(folder: Path, tokenizer: Path, change: Callable[[dict[str, Any]], None] | None = None) -> Path:
     """A published policy of random weights."""
     model = make_smolvla(tokenizer)

@@ -42,9 +42,10 @@ class PackedLinear(nn.Linear):
         return self._packed(input, "gelu", "tanh")
 
     def _plain(self, input: Tensor) -> bool:
-        acts = torch.is_inference_mode_enabled() and not torch.compiler.is_compiling()
+        if torch.compiler.is_compiling() or not torch.is_inference_mode_enabled():  # only the former can be traced
+            return True
         known = input.device.type == "cpu" and self.weight.dtype == torch.float32
-        return not (acts and known) or torch.is_autocast_enabled("cpu")
+        return not known or torch.is_autocast_enabled("cpu")
 
     def _packed(self, input: Tensor, then: str, how: str) -> Tensor:
         key = self.weight.data_ptr(), self.weight._version
