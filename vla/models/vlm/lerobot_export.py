@@ -40,7 +40,7 @@ class LeRobotPolicyExporter:
         """Write a policy; returns the folder.
 
         Raises:
-            UserError: the folder exists, or the policy is no vision-language-action model.
+            UserError: the folder exists, or LeRobot has no such policy.
         """
         from safetensors.torch import save_file
 
@@ -52,11 +52,11 @@ class LeRobotPolicyExporter:
         beginnings = [(ours, theirs) for theirs, ours in model.network.published]
         state = model.network.state_dict()
         weights = {renamed(name, beginnings): tensor.detach().cpu().contiguous() for name, tensor in state.items()}
-        steps = _preprocessing(model), _postprocessing(model)
+        config, steps = _config(model), (_preprocessing(model), _postprocessing(model))
         with atomic_path(self._folder) as draft:
             draft.mkdir(parents=True)
             save_file(weights, draft / "model.safetensors")
-            write_json(draft / CONFIG, _config(model))
+            write_json(draft / CONFIG, config)
             for file, pipeline in zip((PREPROCESSOR, POSTPROCESSOR), steps, strict=True):
                 for step in pipeline:
                     if "state_file" in step:

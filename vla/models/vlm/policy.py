@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from vla.io.errors import UserError
-from vla.io.types import Natural, Shift, Steps, Text
+from vla.io.types import Natural, NonNegative, Shift, Steps, Text
 from vla.models.chunking import after_prefix, require_prefix, with_prefix
 from vla.models.layers import Batch, mean_where
 from vla.models.model import Model, Prediction
@@ -57,6 +57,8 @@ class VisionLanguageAction(Model):
         statistics: whose they are normalised by, those of the demonstrations or of the pretrained policy.
         place: where images of another aspect ratio lie in the square of the network.
         shift: largest random shift of the training images, vertical and horizontal [1/256 of the image height].
+        auxiliary: loss weight of the simulator's state, which a head predicts from what actions see of the last token
+            of the prefix, in training only; 0 omits it.
 
     Raises:
         UserError: state or actions have too many components, a camera is unknown, the trunk does not fit, or `prefix`
@@ -83,17 +85,19 @@ class VisionLanguageAction(Model):
         statistics: Literal["demonstrations", "pretrained"],
         place: Place,
         shift: Shift,
+        auxiliary: NonNegative,
         *,
         spec: Spec,
         tokenizer: ActionTokenizer,
     ) -> None:
-        widths = {"text_width": 1, "width": 1, "auxiliary": 0.0}
-        super().__init__(text, chunk=chunk, execute=execute, shift=shift, spec=spec, tokenizer=tokenizer, **widths)
+        origin = None if trunk is None else Trunk(trunk)
+        built = network() if origin is None else origin.build(network)
+        options = {"chunk": chunk, "execute": execute, "shift": shift, "auxiliary": auxiliary}
+        super().__init__(text, 1, width=built.value_width, spec=spec, tokenizer=tokenizer, **options)
         self.steps, self.copies, self.place, self.statistics, self.prefix = steps, copies, place, statistics, prefix
         require_prefix(prefix, self.execute, chunk)
-        origin = None if trunk is None else Trunk(trunk)
         self.cameras = _cameras(cameras, spec, origin)
-        self.network = network() if origin is None else origin.build(network)
+        self.network = built
         pack(self.network)
         _require_width("state", len(spec.pose), self.network.state_width or len(spec.pose))
         _require_width("action", len(spec.action), self.network.action_width)
@@ -156,9 +160,10 @@ class VisionLanguageAction(Model):
         return super().loss(batch if "time" in batch else self.noised(batch))
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        """Return velocity and target, (R·B, k, A) each."""
+        """Return velocity and target, (R·B, k, A) each; with an auxiliary head also truth: (B, 1, S), normalised."""
         copies = len(batch["time"]) // len(batch["state"])
-        prefix = repeated(self.known(batch), copies)
+        known = self.known(batch)
+        prefix = repeated(known, copies)
         action = self.scaled(batch["action"][:, -1]).repeat(copies, 1, 1)
         noise, time = batch["noise"], batch["time"]
         noisy = time[:, None, None] * noise + (1 - time)[:, None, None] * action
@@ -166,7 +171,8 @@ class VisionLanguageAction(Model):
             executed = self.scaled(batch["executed"][:, -1]).repeat(copies, 1, 1)
             noisy, progress = with_prefix(noisy, 1 - time, executed, batch["length"])
             time = 1 - progress
-        return {"velocity": self.network.velocity(prefix, noisy, time), "target": noise - action}
+        truth = self.predict_truth(known.values[-1][:, :, -1].flatten(1).unsqueeze(1))
+        return {"velocity": self.network.velocity(prefix, noisy, time), "target": noise - action, **truth}
 
     def scaled(self, action: Tensor) -> Tensor:
         """Normalise (…, D) actions, and pad them to (…, A)."""
