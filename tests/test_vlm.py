@@ -152,13 +152,14 @@ def test_the_state_is_read_as_numbers_within_the_prompt(tokenizer: Path) -> None
 
 def test_a_model_overfits_saves_and_ignores_truth() -> None:
     torch.manual_seed(0)
-    model = make_smolvla(copies=4)
+    model = make_smolvla(copies=4, auxiliary=0.1)
     model.train()
     batch = with_text(model, make_batch(1, CHUNK, spec=SPEC))
     batch["action"] = batch["action"] / 9  # about the statistics of the data
-    before = overfit(model, batch, 1)
+    before, unknown = overfit(model, batch, 1), model.train().loss(batch)["truth_loss"].item()
     assert overfit(model.train(), batch, 120) < 0.4 * before
-    other = make_smolvla()
+    assert model.train().loss(batch)["truth_loss"].item() < 0.5 * unknown
+    other = make_smolvla(auxiliary=0.1)
     other.load_state_dict(model.state_dict())
     del batch["truth"]
     with torch.inference_mode():

@@ -79,6 +79,7 @@ SPEC = Spec(
     low=(-9.0, -9.0, -9.0),
     high=(9.0, 9.0, 9.0),
     control_hz=10.0,
+    truth=(("block", 3),),
 )
 
 

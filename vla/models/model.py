@@ -90,17 +90,22 @@ class Model(nn.Module, ABC):
         self.chunk, self.execute = chunk, chunk if execute is None else execute
         if self.execute > chunk:
             raise UserError(f"model.execute={execute} is more than the model.chunk={chunk} actions that are predicted")
-        self.width, self.auxiliary, self.spec, self.tokenizer = width, auxiliary, spec, tokenizer
+        self.width, self.spec, self.tokenizer = width, spec, tokenizer
         self.text = text(width=text_width)
         sizes = [spec.image_size, *([image_size] if image_size else [])]
         self.image_size = sizes[-1]
         self.transforms = Transforms(tuple(Resize((size[0], size[1]), fit) for size in sizes), self.text.tokenize)
         self.shift = RandomShift(*shift)
         self.robot_state = RobotState(spec)
+        self.add_truth_head(width, auxiliary)
+
+    def add_truth_head(self, width: int, auxiliary: float) -> None:
+        """Add the head that predicts the simulator state from features of a width, unless its loss weight is 0."""
+        self.auxiliary = auxiliary
         self.truth_head: nn.Linear | None = None
-        if auxiliary > 0 and spec.truth_size > 0:
-            self.truth_head = nn.Linear(width, spec.truth_size)
-            self.truth_scale = RunningNormalizer(spec.truth_size)
+        if auxiliary > 0 and self.spec.truth_size > 0:
+            self.truth_head = nn.Linear(width, self.spec.truth_size)
+            self.truth_scale = RunningNormalizer(self.spec.truth_size)
 
     def fit(self, states: np.ndarray, actions: np.ndarray) -> None:
         """Fit what the model keeps of the demonstrations, (N, P) states and (N, D) actions of all steps: nothing."""

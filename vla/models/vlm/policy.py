@@ -90,14 +90,14 @@ class VisionLanguageAction(Model):
         spec: Spec,
         tokenizer: ActionTokenizer,
     ) -> None:
-        origin = None if trunk is None else Trunk(trunk)
-        built = network() if origin is None else origin.build(network)
-        options = {"chunk": chunk, "execute": execute, "shift": shift, "auxiliary": auxiliary}
-        super().__init__(text, 1, width=built.value_width, spec=spec, tokenizer=tokenizer, **options)
+        widths = {"text_width": 1, "width": 1, "auxiliary": 0.0}
+        super().__init__(text, chunk=chunk, execute=execute, shift=shift, spec=spec, tokenizer=tokenizer, **widths)
         self.steps, self.copies, self.place, self.statistics, self.prefix = steps, copies, place, statistics, prefix
         require_prefix(prefix, self.execute, chunk)
+        origin = None if trunk is None else Trunk(trunk)
         self.cameras = _cameras(cameras, spec, origin)
-        self.network = built
+        self.network = network() if origin is None else origin.build(network)
+        self.add_truth_head(self.network.value_width, auxiliary)
         pack(self.network)
         _require_width("state", len(spec.pose), self.network.state_width or len(spec.pose))
         _require_width("action", len(spec.action), self.network.action_width)
