@@ -81,11 +81,12 @@ def write_published(folder: Path, name: str, without: str = "") -> dict[str, Ten
 @each
 def test_published_weights_and_statistics_are_loaded(name: str, tmp_path: Path) -> None:
     weights = write_published(tmp_path, name)
-    model = make_policy(name, trunk=str(tmp_path), statistics="pretrained")
+    text = write_tokenizer(tmp_path)
+    model = make_policy(name, text, trunk=str(tmp_path), statistics="pretrained")
     loaded = dict(published(model.network))
     assert loaded.keys() == weights.keys()
     assert all(torch.equal(tensor, weights[weight]) for weight, tensor in loaded.items())
-    other = make_policy(name)
+    other = make_policy(name, text)
     with torch.no_grad():
         assert not torch.equal(model.predict(batch_of(model)).actions, other.predict(batch_of(other)).actions)
         other.state_normalizer.load_state_dict(model.state_normalizer.state_dict())
@@ -102,7 +103,7 @@ def test_a_missing_weight_is_named(name: str, tmp_path: Path) -> None:
 
 @each
 def test_it_trains_and_is_evaluated_and_saved_like_any_other_model(name: str, home: Path) -> None:
-    sizes = {**SIZES, "vocabulary": 256, "action_width": 32}
+    sizes = {**SIZES, "vocabulary": 4096, "action_width": 32}
     network = [f"model.network.{key}={value}" for key, value in sizes.items()]
     tiny = ["model.text.name=null", "model.text.length=160", "model.chunk=8", "model.steps=2", "trainer.max_steps=2"]
     here(home, *SMALL, f"model={name}", *network, *tiny, f"output={name}", f"hydra.run.dir={name}")

@@ -146,8 +146,8 @@ def test_the_state_is_read_as_numbers_within_the_prompt(tokenizer: Path) -> None
         ]
         rows = [prompt._ids(text, special=True) for text in texts]
         assert [row[row != PADDING].tolist() for row in tokens] == rows
-        assert tokens.shape[1] <= 90 and prompt.tokenize(["lift it" * 99]).shape == (1, 90)
-        assert prompt.tokenize(["lift it"]).shape[1] < prompt.tokenize(["lift it, and put it down"]).shape[1]
+        assert tokens.shape[1] <= 90 and prompt.tokenize(["lift it " * 99]).shape == (1, 90)
+        assert prompt.tokenize(["lift it"]).shape[1] < prompt.tokenize(["lift it, and put it down " * 4]).shape[1]
 
 
 def test_a_model_overfits_saves_and_ignores_truth() -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 from vla.models.tokenizers.tokenizer import Uniform
 from vla.models.vlm.network import FlowNetwork, renamed
 from vla.models.vlm.policy import VisionLanguageAction
-from vla.models.vlm.prompt import Prompt
+from vla.models.vlm.prompt import WORDS, Prompt
 from vla.models.vlm.smolvla import SmolVLA
 from vla.spec import Observation, Spec
 
@@ -104,7 +104,7 @@ def write_tokenizer(folder: Path) -> None:
 def make_smolvla(tokenizer: Path | None = None, **options: Any) -> VisionLanguageAction:
     """A tiny SmolVLA with the weights of `fill` and the statistics of `steps`."""
     parts: dict[str, Any] = {
-        "network": partial(SmolVLA, **SMOLVLA),
+        "network": partial(SmolVLA, **(SMOLVLA if tokenizer else {**SMOLVLA, "vocabulary": WORDS})),
         "text": partial(Prompt, str(tokenizer) if tokenizer else None, LENGTH, False),
         "tokenizer": Uniform(spec=SPEC, **defaults_of("tokenizer/uniform", bins=64)),
         "spec": SPEC,

@@ -250,11 +250,11 @@ class Minutes:
         """Take ten steps of LoRA with vision-language-action models of random weights, and time their plans."""
         sizes = self.sizes
         for name, frozen in sizes.vlas.items():
-            what = [f"model={name}", "model/text=utf8", "learner=smolvla", "learner/lora=low_rank", "data.batch_size=8"]
+            what = [f"model={name}", "model/text=words", "learner=smolvla", "learner/lora=low_rank"]
             length = ["trainer.max_steps=10", f"trainer.val_check_interval={NEVER}", "validate.episodes=0"]
             how = [f"trainer={sizes.trainer}", f"trainer.precision={sizes.precision}", f"learner.frozen=[{frozen}]"]
-            self.vla("v", name, 120, "job=train", *what, *length, *how, *self.data(sizes.used))
-        models = [f"{name},model/text=utf8" for name in sizes.vlas]
+            self.vla("v", name, 120, "job=train", "data.batch_size=8", *what, *length, *how, *self.data(sizes.used))
+        models = [f"{name},model/text=words" for name in sizes.vlas]
         asked = [str(self._demonstrations), str(sizes.used), str(sizes.plans), str(sizes.compiled)]
         self.run("v", "plans", 110, sys.executable, str(PROBE), "latency", str(self.out / "v.json"), *asked, *models)
 

@@ -6,6 +6,8 @@ Shapes: B sentences, L tokens, S components of the state, W tokens of the longes
 from __future__ import annotations
 
 import hashlib
+import re
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from vla.models.text.ngrams import TextEncoder
 
 PADDING = -1
 FILE = "tokenizer.json"
+WORDS = 4096  # hashes of words, where no tokenizer is named
 STEP = 16  # tokens: few lengths, so that a program compiled for each can be kept
 BINS = 256  # of a normalised state in -1 … 1
 TRIED = "Task: pick it up, State: -1 0 255;\nAction: "
@@ -33,7 +36,7 @@ class Prompt(TextEncoder):
 
     Args:
         name: folder with the tokenizer.json of the language model, or its name on the hub, OWNER/NAME or
-            OWNER/NAME@REVISION; null: the tokens are the bytes of the text.
+            OWNER/NAME@REVISION; null: the tokens are hashes of words, for a vocabulary of `WORDS`.
         length: L.
         state: whether the state is part of the prompt.
         width: unused.
@@ -89,7 +92,7 @@ class Prompt(TextEncoder):
 
     def _ids(self, text: str, special: bool) -> list[int]:
         if self._tokenizer is None:
-            return list(text.encode())
+            return [zlib.crc32(word.encode()) % WORDS for word in re.findall(r"\w+|[^\w\s]", text.lower())]
         return self._tokenizer.encode(text, add_special_tokens=special).ids
 
     def get_extra_state(self) -> dict[str, Any]:
