@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -205,6 +206,13 @@ def written(folder: Path, tokenizer: Path, change: Callable[[dict[str, Any]], No
     return folder
 
 
+def test_what_lerobot_cannot_build_is_not_exported(tmp_path: Path, tokenizer: Path) -> None:
+    model = make_smolvla(tokenizer, network=partial(SmolVLA, **SMOLVLA | {"stem": [8]}))
+    with pytest.raises(UserError, match=r"no convolutions before the patches: train with model\.network\.stem=\[\]"):
+        LeRobotPolicyExporter(tmp_path / "published").export(as_policy(model, SPEC))
+    assert not [*tmp_path.iterdir()]
+
+
 def test_published_weights_and_statistics_are_loaded(tmp_path: Path, tokenizer: Path) -> None:
     def as_bfloat16(weights: dict[str, Any]) -> None:
         name = "model.vlm_with_expert.vlm.lm_head.weight"  # which is published, and no action depends on it
@@ -315,7 +323,7 @@ def test_a_trunk_that_is_not_there_and_a_tokenizer_that_is_not_are_refused(tmp_p
 def test_a_published_policy_is_fine_tuned_and_evaluated_from_the_command_line(home: Path) -> None:
     write_tokenizer(home / "tokenizer")
     small = ("vision_layers=1", "layers=2", "resolution=32", "vocabulary=320", "vision_width=32", "vision_heads=1")
-    sizes = [f"model.network.{each}" for each in small]
+    sizes = [f"model.network.{each}" for each in (*small, "stem=[]")]
     tiny = [*SMALL, "model=smolvla_tiny", "model.text.name=tokenizer", "trainer.max_steps=2", *sizes]
     here(home, *tiny, "job=train", "output=first", "hydra.run.dir=first")
     to = ["export=lerobot_policy", "export.folder=published"]

@@ -29,7 +29,7 @@ SENTENCES = ("put the red block away", "wait\n", "a sentence of more than twelve
 SMOLVLA: dict[str, Any] = {
     **{"vocabulary": 320, "width": 48, "layers": 4, "heads": 6, "key_heads": 2, "head_width": 8, "feedforward": 64},
     **{"vision_width": 24, "vision_layers": 2, "vision_heads": 3, "vision_feedforward": 32},
-    **{"resolution": 32, "patch": 4, "shuffle": 4, "joint_every": 2},
+    **{"resolution": 32, "patch": 4, "stem": [], "shuffle": 4, "joint_every": 2},
     **{"expert_width": 36, "expert_feedforward": 256},
     **{"state_width": 32, "action_width": 32},
 }

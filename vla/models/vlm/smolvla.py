@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from transformers import LlamaConfig, LlamaModel, SmolVLMConfig, SmolVLMModel
 from transformers.models.llama.modeling_llama import LlamaAttention, apply_rotary_pos_emb
 
+from vla.io.errors import UserError
 from vla.io.types import Count, Layers, Width
 from vla.models.vlm.network import FlowNetwork, Own, Prefix, Rotation, require_multiple, shorten, sizes, with_time
 
@@ -39,6 +40,9 @@ class SmolVLA(FlowNetwork):
         vision_width, vision_layers, vision_heads, vision_feedforward: of the image encoder, a vision transformer.
         resolution: height and width of an image [px].
         patch: height and width of a patch [px].
+        stem: channels of convolutions before the patches, each of which halves the image: from random weights a vision
+            transformer learns sooner with them (T. Xiao et al., "Early Convolutions Help Transformers See Better",
+            arXiv 2106.14881); none in published weights.
         shuffle: so many by so many neighbouring patches become one token.
         expert_width, expert_feedforward: of the expert, whose heads are those of the language model.
         joint_every: 1: no layer attends to the prefix alone.
@@ -73,6 +77,7 @@ class SmolVLA(FlowNetwork):
         vision_feedforward: Width,
         resolution: Count,
         patch: Count,
+        stem: list[Count],
         shuffle: Count,
         expert_width: Width,
         expert_feedforward: Width,
@@ -84,6 +89,7 @@ class SmolVLA(FlowNetwork):
         require_multiple("heads", heads, "key_heads", key_heads)
         require_multiple("vision_width", vision_width, "vision_heads", vision_heads)
         require_multiple("resolution", resolution, "patch times shuffle", patch * shuffle)
+        require_multiple("patch", patch, "two for each convolution of the stem", 2 ** len(stem))
         require_multiple("head_width", head_width, "two", 2)
         require_multiple("expert_width", expert_width, "two", 2)
         self.resolution, self.state_width, self.action_width = resolution, state_width, action_width
@@ -94,6 +100,8 @@ class SmolVLA(FlowNetwork):
         vision = {"num_hidden_layers": vision_layers, "num_attention_heads": vision_heads, "patch_size": patch}
         vision |= {"image_size": resolution, **sizes(vision_width, vision_feedforward)}
         self.vlm = _trunk(text, vision, shuffle)
+        if stem:
+            self.vlm.vision_model.embeddings.patch_embedding = _patches(stem, patch, vision_width)
         self.expert = _expert(shared, joint_every, expert_width, expert_feedforward)
         self.state_proj = nn.Linear(state_width, width)
         self.action_in_proj = nn.Linear(action_width, expert_width)
@@ -102,7 +110,15 @@ class SmolVLA(FlowNetwork):
         self.action_time_mlp_out = nn.Linear(expert_width, expert_width)
 
     def options(self) -> dict[str, Any]:
-        """Return LeRobot's options of this network; the width of the expert is a factor of that of the trunk."""
+        """Return LeRobot's options of this network; the width of the expert is a factor of that of the trunk.
+
+        Raises:
+            UserError: it has a stem, and LeRobot's has none.
+        """
+        if isinstance(self.vlm.vision_model.embeddings.patch_embedding, nn.Sequential):
+            raise UserError(
+                "LeRobot's SmolVLA has no convolutions before the patches: train with model.network.stem=[]"
+            )
         ratio = self.action_in_proj.out_features / self.state_proj.out_features
         layers = {"num_vlm_layers": len(self.expert.layers), "self_attn_every_n_layers": self.joint_every}
         return {**layers, "expert_width_multiplier": ratio, "resize_imgs_with_padding": [self.resolution] * 2}
@@ -186,6 +202,15 @@ def _trunk(text: dict[str, Any], vision: dict[str, Any], shuffle: int) -> SmolVL
     trunk = SmolVLMModel(config)
     shorten(trunk.text_model)
     return trunk
+
+
+def _patches(stem: list[int], patch: int, width: int) -> nn.Sequential:
+    """Build convolutions of stride two, and a map of what they make of a patch to its embedding."""
+    layers: list[nn.Module] = []
+    for before, channels in zip([COLOURS, *stem], stem, strict=False):
+        layers += [nn.Conv2d(before, channels, 3, 2, 1), nn.GroupNorm(1, channels), nn.SiLU()]
+    side = patch // 2 ** len(stem)
+    return nn.Sequential(*layers, nn.Conv2d(stem[-1], width, side, side))
 
 
 def _expert(shared: dict[str, Any], joint_every: int, width: int, feedforward: int) -> LlamaModel:
