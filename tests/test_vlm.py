@@ -150,6 +150,13 @@ def test_the_state_is_read_as_numbers_within_the_prompt(tokenizer: Path) -> None
         assert prompt.tokenize(["lift it"]).shape[1] < prompt.tokenize(["lift it, and put it down " * 4]).shape[1]
 
 
+def test_without_a_tokenizer_tokens_are_words() -> None:
+    prompt = Prompt(None, 20, state=False, width=1)
+    one, same, other, none = prompt.tokenize(["Put it down.", "put it  down .", "put it up.", ""])
+    assert torch.equal(one, same) and (one != other).sum() == 1
+    assert (none != PADDING).sum() == 1 and torch.equal(prompt.tokenize([""]), none[None])
+
+
 def test_a_model_overfits_saves_and_ignores_truth() -> None:
     torch.manual_seed(0)
     model = make_smolvla(copies=4, auxiliary=0.1)

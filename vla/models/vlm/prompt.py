@@ -92,7 +92,7 @@ class Prompt(TextEncoder):
 
     def _ids(self, text: str, special: bool) -> list[int]:
         if self._tokenizer is None:
-            return [zlib.crc32(word.encode()) % WORDS for word in re.findall(r"\w+|[^\w\s]", text.lower())]
+            return [zlib.crc32(word.encode()) % WORDS for word in re.findall(r"\w+|[^\w\s]|\n", text.lower())]
         return self._tokenizer.encode(text, add_special_tokens=special).ids
 
     def get_extra_state(self) -> dict[str, Any]:
