@@ -98,7 +98,7 @@ def test_published_weights_and_statistics_are_loaded(name: str, tmp_path: Path) 
 def test_a_missing_weight_is_named(name: str, tmp_path: Path) -> None:
     write_published(tmp_path, name, without="paligemma_with_expert.gemma_expert.model.layers.1.mlp.up_proj.weight")
     with pytest.raises(UserError, match=r"lacks expert\.layers\.1\.mlp\.up_proj\.weight"):
-        make_policy(name, trunk=str(tmp_path))
+        make_policy(name, write_tokenizer(tmp_path), trunk=str(tmp_path))
 
 
 @each

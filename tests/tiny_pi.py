@@ -26,7 +26,7 @@ from vla.models.vlm.network import FlowNetwork
 from vla.models.vlm.pi0 import PI0
 from vla.models.vlm.pi05 import PI05
 from vla.models.vlm.policy import VisionLanguageAction
-from vla.models.vlm.prompt import Prompt
+from vla.models.vlm.prompt import WORDS, Prompt
 from vla.spec import Spec
 
 # Arguments of the networks; LeRobot's has eight heads at any size.
@@ -109,9 +109,9 @@ def write_tokenizer(folder: Path) -> Path:
     return folder
 
 
-def make_network(name: str) -> FlowNetwork:
+def make_network(name: str, **changes: Any) -> FlowNetwork:
     """A network with the weights of `fill`."""
-    network = KINDS[name](**SIZES, **({"state_width": STATE_WIDTH} if name == "pi0" else {}))
+    network = KINDS[name](**{**SIZES, **changes}, **({"state_width": STATE_WIDTH} if name == "pi0" else {}))
     fill(published(network))
     return network.eval()
 
@@ -120,7 +120,7 @@ def make_policy(name: str, tokenizer: Path | None = None, **options: Any) -> Vis
     """The policy of an option with a tiny network of the weights of `fill`, unless a trunk gives them."""
     text = part_of(f"model/{name}", "text", name=tokenizer and str(tokenizer), length=LENGTH)
     return VisionLanguageAction(
-        partial(make_network, name),
+        partial(make_network, name, **({} if tokenizer else {"vocabulary": WORDS})),
         partial(Prompt, **text),
         **defaults_of(f"model/{name}", chunk=CHUNK, **options),
         spec=SPEC,
