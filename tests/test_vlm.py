@@ -155,6 +155,8 @@ def test_without_a_tokenizer_tokens_are_words() -> None:
     one, same, other, none = prompt.tokenize(["Put it down.", "put it  down .", "put it up.", ""])
     assert torch.equal(one, same) and (one != other).sum() == 1
     assert (none != PADDING).sum() == 1 and torch.equal(prompt.tokenize([""]), none[None])
+    with pytest.raises(UserError, match=r"model\.network\.vocabulary=320 is less than the 4096 words"):
+        make_smolvla(network=partial(SmolVLA, **SMOLVLA))
 
 
 def test_a_model_overfits_saves_and_ignores_truth() -> None:

@@ -117,6 +117,7 @@ class FlowNetwork(nn.Module, ABC):
     resolution: int  # height and width of an image [px]
     state_width: int  # S, padded with zeros; 0: the state is part of the sentence
     action_width: int  # A, padded with zeros
+    vocabulary: int  # tokens of the sentence
     value_width: int  # values of a token in a layer, of all heads
 
     def options(self) -> dict[str, Any]:

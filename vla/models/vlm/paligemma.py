@@ -78,7 +78,7 @@ class PaliGemmaWithExpert(FlowNetwork):
         require_multiple("head_width", head_width, "two", 2)
         require_multiple("expert_width", expert_width, "two", 2)
         self.resolution, self.action_width, self.state_width = resolution, action_width, 0
-        self.value_width = head_width
+        self.value_width, self.vocabulary = head_width, vocabulary
         shared = {"num_attention_heads": heads, "num_key_value_heads": 1, "head_dim": head_width}
         shared |= {"num_hidden_layers": layers}
         text = {**shared, "vocab_size": vocabulary, **sizes(width, feedforward)}

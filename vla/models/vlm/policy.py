@@ -26,7 +26,7 @@ from vla.models.tokenizers.tokenizer import ActionTokenizer
 from vla.models.vlm.network import FlowNetwork, Prefix
 from vla.models.vlm.normalizer import Kind, Normalizer
 from vla.models.vlm.packed_linear import pack
-from vla.models.vlm.prompt import PADDING, Prompt
+from vla.models.vlm.prompt import PADDING, WORDS, Prompt
 from vla.models.vlm.trunk import Trunk
 from vla.spec import Spec
 
@@ -61,8 +61,8 @@ class VisionLanguageAction(Model):
             of the prefix, in training only; 0 omits it.
 
     Raises:
-        UserError: state or actions have too many components, a camera is unknown, the trunk does not fit, or `prefix`
-            leaves fewer actions than are executed.
+        UserError: state or actions have too many components, a camera is unknown, the trunk does not fit, the
+            vocabulary is too small for words, or `prefix` leaves fewer actions than are executed.
     """
 
     uses_tokens = False
@@ -97,6 +97,11 @@ class VisionLanguageAction(Model):
         origin = None if trunk is None else Trunk(trunk)
         self.cameras = _cameras(cameras, spec, origin)
         self.network = network() if origin is None else origin.build(network)
+        if self.text.name is None and self.network.vocabulary < WORDS:
+            raise UserError(
+                f"model.network.vocabulary={self.network.vocabulary} is less than the {WORDS} words of a prompt "
+                "without a tokenizer: raise it, or give model.text.name"
+            )
         self.add_truth_head(self.network.value_width, auxiliary)
         pack(self.network)
         _require_width("state", len(spec.pose), self.network.state_width or len(spec.pose))

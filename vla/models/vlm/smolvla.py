@@ -93,6 +93,7 @@ class SmolVLA(FlowNetwork):
         require_multiple("head_width", head_width, "two", 2)
         require_multiple("expert_width", expert_width, "two", 2)
         self.resolution, self.state_width, self.action_width = resolution, state_width, action_width
+        self.vocabulary = vocabulary
         self.head_width, self.joint_every, self.value_width = head_width, joint_every, key_heads * head_width
         attention = {"num_attention_heads": heads, "num_key_value_heads": key_heads, "head_dim": head_width}
         shared = {**attention, "num_hidden_layers": layers, "rms_norm_eps": EPSILON, **NO_TOKENS}
