@@ -6,7 +6,7 @@ import pytest
 import torch
 from defaults import defaults_of
 from tiny_pi import KINDS, STEPS, inputs, make_network
-from tiny_vla import SMOLVLA, deviation, reference
+from tiny_vla import KEYPOINTS, SMOLVLA, deviation, reference
 from tiny_vla import inputs as of_smolvla
 from torch import Tensor
 
@@ -82,7 +82,7 @@ def test_a_time_per_action_is_that_of_the_action(name: str) -> None:
 @pytest.mark.parametrize("name", [*KINDS, "smolvla"])
 def test_all_that_is_trained_has_a_gradient(name: str, modules: tuple[str, ...]) -> None:
     """Otherwise processes of a training would wait for those of some weights."""
-    smolvla = SmolVLA(**SMOLVLA | {"stem": [8]})
+    smolvla = SmolVLA(**SMOLVLA | KEYPOINTS)
     network, given = (smolvla, of_smolvla(SMOLVLA)) if name == "smolvla" else (make_network(name), inputs())
     if modules:
         LoRA(**defaults_of("learner/lora/low_rank", modules=modules)).inject(network)

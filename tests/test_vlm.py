@@ -17,6 +17,7 @@ from fake_batch import as_policy, make_batch, overfit, with_text
 from safetensors.torch import load_file, save_file
 from tiny_vla import (
     CHUNK,
+    KEYPOINTS,
     REFERENCE,
     SENTENCES,
     SMOLVLA,
@@ -39,7 +40,7 @@ from vla.models.vlm.lerobot_export import LeRobotPolicyExporter
 from vla.models.vlm.network import renamed
 from vla.models.vlm.normalizer import Normalizer
 from vla.models.vlm.policy import resize_with_padding
-from vla.models.vlm.prompt import PADDING, Prompt
+from vla.models.vlm.prompt import PADDING, WORDS, Prompt
 from vla.models.vlm.smolvla import SmolVLA
 
 TOLERANCE = 1e-5
@@ -159,16 +160,18 @@ def test_without_a_tokenizer_tokens_are_words() -> None:
         make_smolvla(network=partial(SmolVLA, **SMOLVLA))
 
 
-def test_a_model_overfits_saves_and_ignores_truth() -> None:
+@pytest.mark.parametrize("seen", [{}, KEYPOINTS], ids=["patches", "keypoints"])
+def test_a_model_overfits_saves_and_ignores_truth(seen: dict[str, Any]) -> None:
     torch.manual_seed(0)
-    model = make_smolvla(copies=4, auxiliary=0.1)
+    network = partial(SmolVLA, **SMOLVLA | {"vocabulary": WORDS, **seen})
+    model = make_smolvla(network=network, copies=4, auxiliary=0.1)
     model.train()
     batch = with_text(model, make_batch(1, CHUNK, spec=SPEC))
     batch["action"] = batch["action"] / 9  # about the statistics of the data
     before, unknown = overfit(model, batch, 1), model.train().loss(batch)["truth_loss"].item()
     assert overfit(model.train(), batch, 120) < 0.4 * before
     assert model.train().loss(batch)["truth_loss"].item() < 0.5 * unknown
-    other = make_smolvla(auxiliary=0.1)
+    other = make_smolvla(network=network, auxiliary=0.1)
     other.load_state_dict(model.state_dict())
     del batch["truth"]
     with torch.inference_mode():
@@ -216,10 +219,15 @@ def written(folder: Path, tokenizer: Path, change: Callable[[dict[str, Any]], No
 
 
 def test_what_lerobot_cannot_build_is_not_exported(tmp_path: Path, tokenizer: Path) -> None:
-    model = make_smolvla(tokenizer, network=partial(SmolVLA, **SMOLVLA | {"stem": [8]}))
-    with pytest.raises(UserError, match=r"no convolutions before the patches: train with model\.network\.stem=\[\]"):
+    model = make_smolvla(tokenizer, network=partial(SmolVLA, **SMOLVLA | KEYPOINTS))
+    with pytest.raises(UserError, match=r"sees no keypoints: train with model\.network\.keypoints=0"):
         LeRobotPolicyExporter(tmp_path / "published").export(as_policy(model, SPEC))
     assert not [*tmp_path.iterdir()]
+
+
+def test_keypoints_without_an_image_encoder_are_refused() -> None:
+    with pytest.raises(UserError, match=r"keypoints=3 need an image encoder, model\.network\.image"):
+        SmolVLA(**SMOLVLA | {"keypoints": 3})
 
 
 def test_published_weights_and_statistics_are_loaded(tmp_path: Path, tokenizer: Path) -> None:
@@ -332,7 +340,7 @@ def test_a_trunk_that_is_not_there_and_a_tokenizer_that_is_not_are_refused(tmp_p
 def test_a_published_policy_is_fine_tuned_and_evaluated_from_the_command_line(home: Path) -> None:
     write_tokenizer(home / "tokenizer")
     small = ("vision_layers=1", "layers=2", "resolution=32", "vocabulary=320", "vision_width=32", "vision_heads=1")
-    sizes = [f"model.network.{each}" for each in (*small, "stem=[]")]
+    sizes = [f"model.network.{each}" for each in (*small, "keypoints=0")]
     tiny = [*SMALL, "model=smolvla_tiny", "model.text.name=tokenizer", "trainer.max_steps=2", *sizes]
     here(home, *tiny, "job=train", "output=first", "hydra.run.dir=first")
     to = ["export=lerobot_policy", "export.folder=published"]

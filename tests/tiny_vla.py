@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from defaults import defaults_of
+from fake_batch import TINY_IMAGE
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -29,10 +30,11 @@ SENTENCES = ("put the red block away", "wait\n", "a sentence of more than twelve
 SMOLVLA: dict[str, Any] = {
     **{"vocabulary": 320, "width": 48, "layers": 4, "heads": 6, "key_heads": 2, "head_width": 8, "feedforward": 64},
     **{"vision_width": 24, "vision_layers": 2, "vision_heads": 3, "vision_feedforward": 32},
-    **{"resolution": 32, "patch": 4, "stem": [], "shuffle": 4, "joint_every": 2},
+    **{"resolution": 32, "patch": 4, "shuffle": 4, "image": None, "keypoints": 0, "joint_every": 2},
     **{"expert_width": 36, "expert_feedforward": 256},
     **{"state_width": 32, "action_width": 32},
 }
+KEYPOINTS: dict[str, Any] = {"image": TINY_IMAGE, "keypoints": 3}  # change to see instead of patches
 
 
 def fill(weights: Iterable[tuple[str, Tensor]]) -> None:

@@ -9,6 +9,7 @@ components of a padded action, E width of the trunk, F width of the expert, H wi
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -18,12 +19,12 @@ from transformers import LlamaConfig, LlamaModel, SmolVLMConfig, SmolVLMModel
 from transformers.models.llama.modeling_llama import LlamaAttention, apply_rotary_pos_emb
 
 from vla.io.errors import UserError
-from vla.io.types import Count, Layers, Width
+from vla.io.types import Count, Layers, Natural, Width
+from vla.models.vision.image_tokenizer import ImageEncoder, Keypoints
 from vla.models.vlm.network import FlowNetwork, Own, Prefix, Rotation, require_multiple, shorten, sizes, with_time
 
 ROPE_BASE = 10_000.0  # of the policy, whatever that of the language model was
 EPSILON = 1e-5  # of RMS norms
-COLOURS = 3
 NO_TOKENS: dict[str, None] = {"bos_token_id": None, "eos_token_id": None}  # nothing is generated
 
 
@@ -40,10 +41,10 @@ class SmolVLA(FlowNetwork):
         vision_width, vision_layers, vision_heads, vision_feedforward: of the image encoder, a vision transformer.
         resolution: height and width of an image [px].
         patch: height and width of a patch [px].
-        stem: channels of convolutions before the patches, each of which halves the image: from random weights a vision
-            transformer learns sooner with them (T. Xiao et al., "Early Convolutions Help Transformers See Better",
-            arXiv 2106.14881); none in published weights.
         shuffle: so many by so many neighbouring patches become one token.
+        image: factory of an image encoder, conditioned on the sum of the words, for `keypoints`.
+        keypoints: tokens per image that take the place of the vision transformer's: from random weights that needs many
+            more images until it knows where things are; 0: none, as in published weights.
         expert_width, expert_feedforward: of the expert, whose heads are those of the language model.
         joint_every: 1: no layer attends to the prefix alone.
         state_width: S.
@@ -77,8 +78,9 @@ class SmolVLA(FlowNetwork):
         vision_feedforward: Width,
         resolution: Count,
         patch: Count,
-        stem: list[Count],
         shuffle: Count,
+        image: Callable[..., ImageEncoder] | None,
+        keypoints: Natural,
         expert_width: Width,
         expert_feedforward: Width,
         joint_every: Layers,
@@ -89,7 +91,6 @@ class SmolVLA(FlowNetwork):
         require_multiple("heads", heads, "key_heads", key_heads)
         require_multiple("vision_width", vision_width, "vision_heads", vision_heads)
         require_multiple("resolution", resolution, "patch times shuffle", patch * shuffle)
-        require_multiple("patch", patch, "two for each convolution of the stem", 2 ** len(stem))
         require_multiple("head_width", head_width, "two", 2)
         require_multiple("expert_width", expert_width, "two", 2)
         self.resolution, self.state_width, self.action_width = resolution, state_width, action_width
@@ -101,8 +102,13 @@ class SmolVLA(FlowNetwork):
         vision = {"num_hidden_layers": vision_layers, "num_attention_heads": vision_heads, "patch_size": patch}
         vision |= {"image_size": resolution, **sizes(vision_width, vision_feedforward)}
         self.vlm = _trunk(text, vision, shuffle)
-        if stem:
-            self.vlm.vision_model.embeddings.patch_embedding = _patches(stem, patch, vision_width)
+        self.keypoints: KeypointTokens | None = None
+        if keypoints:
+            if image is None:
+                raise UserError(f"model.network.keypoints={keypoints} need an image encoder, model.network.image")
+            self.keypoints = KeypointTokens(image, keypoints, width)
+            nn.init.normal_(self.vlm.text_model.embed_tokens.weight, std=width**-0.5)  # words as large as keypoints
+            del self.vlm.vision_model, self.vlm.connector
         self.expert = _expert(shared, joint_every, expert_width, expert_feedforward)
         self.state_proj = nn.Linear(state_width, width)
         self.action_in_proj = nn.Linear(action_width, expert_width)
@@ -114,12 +120,10 @@ class SmolVLA(FlowNetwork):
         """Return LeRobot's options of this network; the width of the expert is a factor of that of the trunk.
 
         Raises:
-            UserError: it has a stem, and LeRobot's has none.
+            UserError: it sees keypoints, and LeRobot's does not.
         """
-        if isinstance(self.vlm.vision_model.embeddings.patch_embedding, nn.Sequential):
-            raise UserError(
-                "LeRobot's SmolVLA has no convolutions before the patches: train with model.network.stem=[]"
-            )
+        if self.keypoints is not None:
+            raise UserError("LeRobot's SmolVLA sees no keypoints: train with model.network.keypoints=0")
         ratio = self.action_in_proj.out_features / self.state_proj.out_features
         layers = {"num_vlm_layers": len(self.expert.layers), "self_attn_every_n_layers": self.joint_every}
         return {**layers, "expert_width_multiplier": ratio, "resize_imgs_with_padding": [self.resolution] * 2}
@@ -127,12 +131,11 @@ class SmolVLA(FlowNetwork):
     def prefix(self, images: Tensor, cameras: Tensor, tokens: Tensor, sentence: Tensor, state: Tensor | None) -> Prefix:
         """Encode images, sentence and state; every layer of the expert gets keys and values as it uses them."""
         assert state is not None
-        seen = self.vlm.connector(self.vlm.vision_model(pixel_values=images.flatten(0, 1)).last_hidden_state)
-        seen = seen.unflatten(0, images.shape[:2])  # (B, C, N, E)
-        present = cameras.repeat_interleave(seen.shape[2], 1)
         read = self.vlm.text_model.embed_tokens(tokens)
-        scale = math.sqrt(read.shape[-1])
-        hidden = torch.cat([seen.flatten(1, 2) * scale, read * scale, self.state_proj(state).unsqueeze(1)], 1)
+        read = read * math.sqrt(read.shape[-1])
+        seen = self._see(images, (read * sentence.unsqueeze(-1)).sum(1))
+        present = cameras.repeat_interleave(seen.shape[2], 1)
+        hidden = torch.cat([seen.flatten(1, 2), read, self.state_proj(state).unsqueeze(1)], 1)
         present = torch.cat([present, sentence, sentence.new_ones(len(sentence), 1)], 1)  # (B, P)
         mask = present[:, None, None, :].repeat(1, 1, present.shape[1], 1)  # (B, 1, P, P)
         mask[:, :, :-1, -1] = False  # only the state sees the state
@@ -142,6 +145,16 @@ class SmolVLA(FlowNetwork):
             hidden = layer(hidden, attention_mask=mask, position_embeddings=rotation, past_key_values=own)
             pairs.append(expert.self_attn.read(own.keys, own.values))
         return Prefix(tuple(keys for keys, _ in pairs), tuple(values for _, values in pairs), present)
+
+    def _see(self, images: Tensor, words: Tensor) -> Tensor:
+        """Return tokens of (B, C, 3, H, W) images, (B, C, N, E); keypoints depend on the sum of the words, (B, E)."""
+        every = images.flatten(0, 1)
+        if self.keypoints is not None:
+            seen = self.keypoints(every, words.repeat_interleave(images.shape[1], 0))
+        else:
+            seen = self.vlm.connector(self.vlm.vision_model(pixel_values=every).last_hidden_state)
+            seen = seen * math.sqrt(seen.shape[-1])
+        return seen.unflatten(0, images.shape[:2])
 
     def velocity(self, prefix: Prefix, noisy: Tensor, time: Tensor) -> Tensor:
         """Predict the velocity of (B, k, A) noisy actions at times (B,) or (B, k)."""
@@ -157,6 +170,29 @@ class SmolVLA(FlowNetwork):
             mask, rotation = (joint, after) if layer.self_attn.joint else (known, first)
             hidden = layer(hidden, attention_mask=mask, position_embeddings=rotation, prefix=(keys, values))
         return self.action_out_proj(self.expert.norm(hidden).float())
+
+
+class KeypointTokens(nn.Module):
+    """Keypoints of an image as tokens, each with an embedding of its number.
+
+    Args:
+        image: factory of the image encoder, which is conditioned on the sentence.
+        keypoints: M.
+        width: E.
+    """
+
+    def __init__(self, image: Callable[..., ImageEncoder], keypoints: int, width: int) -> None:
+        super().__init__()
+        self.sentence = nn.LayerNorm(width)
+        self.encoder = image(text_width=width)
+        self.keypoints = Keypoints(self.encoder.channels, keypoints)
+        self.tokens = nn.Linear(self.keypoints.width, width)
+        self.number = nn.Parameter(torch.randn(keypoints, width))
+
+    def forward(self, images: Tensor, words: Tensor) -> Tensor:
+        """Map (B, 3, H, W) images in -1 … 1 to (B, M, E), given the (B, E) sum of the words of a sentence."""
+        features = self.encoder((images + 1) / 2, self.sentence(words))
+        return self.tokens(self.keypoints(features)) + self.number
 
 
 class ExpertAttention(LlamaAttention):
@@ -203,15 +239,6 @@ def _trunk(text: dict[str, Any], vision: dict[str, Any], shuffle: int) -> SmolVL
     trunk = SmolVLMModel(config)
     shorten(trunk.text_model)
     return trunk
-
-
-def _patches(stem: list[int], patch: int, width: int) -> nn.Sequential:
-    """Build convolutions of stride two, and a map of what they make of a patch to its embedding."""
-    layers: list[nn.Module] = []
-    for before, channels in zip([COLOURS, *stem], stem, strict=False):
-        layers += [nn.Conv2d(before, channels, 3, 2, 1), nn.GroupNorm(1, channels), nn.SiLU()]
-    side = patch // 2 ** len(stem)
-    return nn.Sequential(*layers, nn.Conv2d(stem[-1], width, side, side))
 
 
 def _expert(shared: dict[str, Any], joint_every: int, width: int, feedforward: int) -> LlamaModel:
