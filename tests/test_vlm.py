@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 import torch
 from command_line import SMALL, here
+from defaults import defaults_of
 from fake_batch import as_policy, make_batch, overfit, with_text
 from safetensors.torch import load_file, save_file
+from small_training import CONFIG, loader, make_trainer
 from tiny_vla import (
     CHUNK,
     KEYPOINTS,
@@ -36,12 +38,16 @@ from tiny_vla import (
 
 from vla.config.compose import compose
 from vla.io.errors import UserError
+from vla.models.learner import Learner
+from vla.models.lora import LoRA
+from vla.models.policy_folder import read_policy
 from vla.models.vlm.lerobot_export import LeRobotPolicyExporter
 from vla.models.vlm.network import renamed
 from vla.models.vlm.normalizer import Normalizer
 from vla.models.vlm.policy import resize_with_padding
 from vla.models.vlm.prompt import PADDING, WORDS, Prompt
 from vla.models.vlm.smolvla import SmolVLA
+from vla.training.checkpoints import AtomicCheckpointIO
 
 TOLERANCE = 1e-5
 
@@ -253,6 +259,27 @@ def test_published_weights_and_statistics_are_loaded(tmp_path: Path, tokenizer: 
     assert torch.equal(model.action_normalizer.mean, ours.action_normalizer.mean)
 
 
+@pytest.mark.parametrize("frozen", [[], ["network.vlm"]])
+def test_factors_beside_published_weights_are_in_the_policy(frozen: list[str], tmp_path: Path, tokenizer: Path) -> None:
+    published = written(tmp_path / "published", tokenizer)
+    factors = LoRA(**defaults_of("learner/lora/low_rank", modules=("q_proj", "v_proj")))
+    model, plain = (make_smolvla(tokenizer, trunk=str(published)) for _ in range(2))
+    options = defaults_of("learner/default", lr=1e-2, warmup_steps=0, frozen=frozen, lora=factors)
+    learner = Learner(**options, model=model, spec=SPEC, config=CONFIG)
+    trainer, batch = make_trainer(2), make_batch(1, CHUNK, spec=SPEC)
+    trainer.fit(learner, loader(learner, [batch] * 2))
+    trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+    trainer.save_checkpoint(tmp_path / "policy", weights_only=False)
+    saved, batch = read_policy(tmp_path), with_text(model, batch)
+    # A training that resumes finds them before it has factors.
+    assert saved.training.trunks.keys() <= dict(plain.named_modules()).keys()
+    with torch.inference_mode():
+        before = plain.eval().predict(batch).actions
+        saved.restore(plain)
+        trained, restored = (each.eval().predict(batch).actions for each in (model, plain))
+    assert (trained - restored).abs().max() < 1e-5 < 1e-3 < (trained - before).abs().max()
+
+
 def test_a_trunk_alone_leaves_the_expert_random(tmp_path: Path, tokenizer: Path) -> None:
     folder = tmp_path / "trunk"
     folder.mkdir()
@@ -288,7 +315,7 @@ def _resize(weights: dict[str, Any]) -> None:
     ("change", "sentence"),
     [
         (_drop, "lacks state_proj.bias"),
-        (_add, "has a weight that the model lacks, model.other.bias"),
+        (_add, "has model.other.bias, which the model lacks"),
         (_resize, "model.state_proj.bias in .* has the shape"),
     ],
 )
@@ -321,6 +348,8 @@ def test_a_normaliser_without_the_action_and_a_camera_without_counterpart_are_re
         make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "front"})
     with pytest.raises(UserError, match="names top, and the demonstrations have front, wrist"):
         make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "front", "third": "top"})
+    with pytest.raises(UserError, match="names thrid, and .*published sees front, third"):
+        make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "front", "third": None, "thrid": "wrist"})
     one = make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "wrist", "third": None})
     assert one.cameras == ["wrist"]
 
@@ -347,8 +376,8 @@ def test_a_published_policy_is_fine_tuned_and_evaluated_from_the_command_line(ho
     here(home, "job=export", "checkpoint=first", *to, "output=exported", "hydra.run.dir=exported")
     refused = here(home, *SMALL, "pretrained=published", "job=train", "output=bc", "hydra.run.dir=bc", ok=False)
     assert "as in model=smolvla" in refused.stderr
-    frozen = ["pretrained=published", "learner.frozen=[network.vlm]", "output=second", "hydra.run.dir=second"]
-    here(home, *tiny, *frozen, "evaluate.episodes=1")
+    parts = ["pretrained=published", "learner.frozen=[network.vlm]", "learner/lora=low_rank"]
+    here(home, *tiny, *parts, "output=second", "hydra.run.dir=second", "evaluate.episodes=1")
     published, tuned = (load_file(home / name / "model.safetensors") for name in ("published", "second/policy"))
     name = "connector.modality_projection.proj.weight"
     theirs, ours = published[f"model.vlm_with_expert.vlm.model.{name}"], tuned.get(f"network.vlm.{name}")

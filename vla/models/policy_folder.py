@@ -116,7 +116,7 @@ class SavedPolicy:
         Raises:
             UserError: the trunks are larger than the memory.
         """
-        elsewhere = sum(source.size for source in self.training.trunks.values())
+        elsewhere = sum(source.size for source in {*self.training.trunks.values()})
         if elsewhere > (free := free_memory() * memory()):
             raise UserError(
                 f"{self.folder} was trained on weights of {elsewhere / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free"

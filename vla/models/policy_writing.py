@@ -87,13 +87,16 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
 def _card(config: Mapping[str, Any], spec: Mapping[str, Any], training: files.Training, count: int) -> str:
     """Return what a person reads of a policy, with the header that the hub reads."""
     model, task = (str(config[name].get("_target_", name)).rpartition(".")[2] for name in ("model", "task"))
+    parts = dict[Source, list[str]]()
+    for name, source in training.trunks.items():
+        parts.setdefault(source, []).append(name)
     rows = {
         "weights": f"{count / 1e6:.2f} million numbers",
         "cameras": f"{', '.join(spec['cameras'])} of {' by '.join(map(str, spec['image_size']))} px",
         "state": ", ".join(spec["state"]),
         "actions": f"{', '.join(spec['action'])} at {spec['control_hz']:g} Hz",
         "training": f"{training.steps} steps, seed {training.seed}, demonstrations {training.windows or 'unknown'}",
-        **{f"trunk {name}": f"{source}, not in this folder" for name, source in training.trunks.items()},
+        **{f"trunk {', '.join(names)}": f"{source}, not in this folder" for source, names in parts.items()},
         **{name: f"{value:.4g}" for name, value in training.figures.items()},
     }
     table = "\n".join(f"| {name} | {text} |" for name, text in rows.items())

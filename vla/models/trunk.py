@@ -53,11 +53,12 @@ def trunks(model: nn.Module) -> dict[str, Source]:
     """Return name → source of the parts whose weights came from somewhere else and are not trained."""
     found = dict[str, Source]()
     for name, module in model.named_modules():
+        part = name.removesuffix(".base_layer")  # of a linear map with factors of LoRA: it is called as without them
         source = getattr(module, "source", None)
-        if not isinstance(source, Source) or is_within(name, found):
+        if not isinstance(source, Source) or is_within(part, found):
             continue
         if not any(weight.requires_grad and not is_factor(each) for each, weight in module.named_parameters()):
-            found[name] = source
+            found[part] = source
     return found
 
 
@@ -65,7 +66,7 @@ def evaluate_trunk(module: nn.Module) -> None:
     """Put a trunk into evaluation mode, in which nothing in it changes; dropout before factors of LoRA goes on."""
     module.eval()
     for name, part in module.named_modules():
-        part.train(is_factor(f"{name}."))
+        part.train(is_factor(f".{name}."))
 
 
 def require_trunks(model: nn.Module, named: Mapping[str, Source], policy: object) -> None:

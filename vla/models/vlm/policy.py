@@ -247,6 +247,8 @@ def _cameras(named: dict[str, str | None] | None, spec: Spec, trunk: Trunk | Non
         return [*spec.cameras]
     if missing := [camera for camera in seen if camera not in named]:
         raise UserError(f"model.cameras has no counterpart of {', '.join(missing)}, which {trunk} sees: null for none")
+    if seen and (unknown := [camera for camera in named if camera not in seen]):
+        raise UserError(f"model.cameras names {', '.join(unknown)}, and {trunk} sees {', '.join(seen)}")
     chosen = [camera for camera in named.values() if camera is not None]
     if unknown := [camera for camera in chosen if camera not in spec.cameras]:
         raise UserError(f"model.cameras names {', '.join(unknown)}, and the demonstrations have {ours}")

@@ -101,7 +101,7 @@ class Trunk:
                     )
                 found[name] = tensor.to(torch.float32, copy=True)
             elif self.is_policy and not theirs.startswith(built.unused):
-                raise UserError(f"{self} has a weight that the model lacks, {theirs}: it is of another architecture")
+                raise UserError(f"{self} has {theirs}, which the model lacks: it has other parts, see model.network")
         parts = ("",) if self.is_policy else tuple(ours for _, ours in built.pretrained)
         if missing := [name for name in own if name not in found and name.startswith(parts)]:
             raise UserError(f"{self} lacks {missing[0]} and {len(missing) - 1} other weights of the model")
