@@ -10,11 +10,13 @@ from typing import Any
 import lightning
 import pytest
 import torch
+from defaults import defaults_of
 from fake_batch import make_act, make_batch, make_bc, make_decoder, make_rt1, with_text
 from small_training import fit, loader, make_learner, make_trainer
 
 from vla.models.model import Model
-from vla.models.vision.timm_encoders import FilmBackbone
+from vla.models.text.ngrams import NGrams
+from vla.models.vision.timm_encoders import FilmBackbone, FilmEfficientNet
 from vla.training.checkpoints import AtomicCheckpointIO
 
 
@@ -141,6 +143,18 @@ def test_parts_have_rates_of_their_own_and_frozen_ones_stay() -> None:
     assert found["context.features.images.0.convs.0.weight"] == pytest.approx(whole / 2)
     changed = [name for name, value in model.named_parameters() if not torch.equal(value, before[name])]
     assert not any(name.startswith("text.") for name in changed) and "context.fuse.1.weight" in changed
+
+
+@pytest.mark.parametrize("frozen", [["features", "text"], []])
+def test_nothing_is_counted_or_averaged_in_a_frozen_part(frozen: list[str]) -> None:
+    image = partial(FilmEfficientNet, "test_efficientnet", False, 8)
+    model = make_bc(image=image, text=partial(NGrams, **defaults_of("model/text/known_words", vocabulary=64)))
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    fit(make_learner(model, frozen=frozen), make_batch(1), 2)
+    changed = [name for name, value in model.state_dict().items() if not torch.equal(value, before[name])]
+    counted = {"text.heard", "features.images.0.stem.1.running_var", "features.proprioception.normalizer.mean"}
+    assert counted <= set(before) and counted.isdisjoint(changed) == bool(frozen)
+    assert any(name.startswith(("features", "text")) for name in changed) != bool(frozen)
 
 
 @pytest.mark.parametrize(

@@ -348,7 +348,7 @@ def test_a_normaliser_without_the_action_and_a_camera_without_counterpart_are_re
         make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "front"})
     with pytest.raises(UserError, match="names top, and the demonstrations have front, wrist"):
         make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "front", "third": "top"})
-    with pytest.raises(UserError, match="names thrid, and .*published sees front, third"):
+    with pytest.raises(UserError, match=r"names thrid, and .*published sees front, third"):
         make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "front", "third": None, "thrid": "wrist"})
     one = make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "wrist", "third": None})
     assert one.cameras == ["wrist"]

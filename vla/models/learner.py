@@ -22,7 +22,7 @@ from vla.models.layers import Batch
 from vla.models.lora import LoRA
 from vla.models.model import Model
 from vla.models.recomputation import recompute_layers
-from vla.models.trunk import evaluate_trunk, trunks
+from vla.models.trunk import evaluate_frozen, trunks
 from vla.spec import Spec
 
 CHECK_FINITE_EVERY = 50  # steps
@@ -40,7 +40,8 @@ class Learner(LightningModule):
         compile: compile the model with torch.compile.
         ema: decay per step of the EMA weights, which are the ones evaluated and saved; 0 disables EMA.
         rates: part of the model, such as context or context.image, → factor of its learning rate.
-        frozen: parts that are not trained, but for factors of LoRA in them.
+        frozen: parts that are not trained, but for factors of LoRA in them: neither weights nor what they count and
+            average, such as the statistics of batch normalisation.
         lora: linear maps that learn by low-rank factors; None: none.
         checkpointing: compute activations within layers again for the gradients, instead of keeping them.
         model: the model to train.
@@ -82,8 +83,9 @@ class Learner(LightningModule):
             recompute_layers(model)
         self._groups()  # names of unknown parts are refused now, and frozen ones are frozen before they are distributed
         self._trunks = trunks(model)
-        for name in self._trunks:
-            evaluate_trunk(model.get_submodule(name))
+        modules = dict(model.named_modules())
+        for name in modules.keys() & {*self._trunks, *frozen}:  # what is frozen may also be a single parameter
+            evaluate_frozen(modules[name])
 
     def _groups(self) -> list[dict[str, Any]]:
         return self.model.parameter_groups(self._lr, self._weight_decay, self._rates, self._frozen)

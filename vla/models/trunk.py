@@ -62,8 +62,8 @@ def trunks(model: nn.Module) -> dict[str, Source]:
     return found
 
 
-def evaluate_trunk(module: nn.Module) -> None:
-    """Put a trunk into evaluation mode, in which nothing in it changes; dropout before factors of LoRA goes on."""
+def evaluate_frozen(module: nn.Module) -> None:
+    """Put a part into evaluation mode, in which nothing in it changes; dropout before factors of LoRA goes on."""
     module.eval()
     for name, part in module.named_modules():
         part.train(is_factor(f".{name}."))
