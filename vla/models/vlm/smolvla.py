@@ -51,7 +51,7 @@ class SmolVLA(FlowNetwork):
         action_width: A.
 
     Raises:
-        UserError: sizes do not divide each other.
+        UserError: sizes do not divide each other, or keypoints have no image encoder.
     """
 
     kind = "smolvla"
@@ -133,7 +133,7 @@ class SmolVLA(FlowNetwork):
         assert state is not None
         read = self.vlm.text_model.embed_tokens(tokens)
         read = read * math.sqrt(read.shape[-1])
-        seen = self._see(images, (read * sentence.unsqueeze(-1)).sum(1))
+        seen = self._see(images, read, sentence)  # (B, C, N, E)
         present = cameras.repeat_interleave(seen.shape[2], 1)
         hidden = torch.cat([seen.flatten(1, 2), read, self.state_proj(state).unsqueeze(1)], 1)
         present = torch.cat([present, sentence, sentence.new_ones(len(sentence), 1)], 1)  # (B, P)
@@ -146,10 +146,11 @@ class SmolVLA(FlowNetwork):
             pairs.append(expert.self_attn.read(own.keys, own.values))
         return Prefix(tuple(keys for keys, _ in pairs), tuple(values for _, values in pairs), present)
 
-    def _see(self, images: Tensor, words: Tensor) -> Tensor:
-        """Return tokens of (B, C, 3, H, W) images, (B, C, N, E); keypoints depend on the sum of the words, (B, E)."""
+    def _see(self, images: Tensor, read: Tensor, sentence: Tensor) -> Tensor:
+        """Return tokens of (B, C, 3, H, W) images, (B, C, N, E); keypoints depend on the (B, L, E) words, too."""
         every = images.flatten(0, 1)
         if self.keypoints is not None:
+            words = (read * sentence.unsqueeze(-1)).sum(1)
             seen = self.keypoints(every, words.repeat_interleave(images.shape[1], 0))
         else:
             seen = self.vlm.connector(self.vlm.vision_model(pixel_values=every).last_hidden_state)
