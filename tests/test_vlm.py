@@ -371,13 +371,15 @@ def test_a_published_policy_is_fine_tuned_and_evaluated_from_the_command_line(ho
     small = ("vision_layers=1", "layers=2", "resolution=32", "vocabulary=320", "vision_width=32", "vision_heads=1")
     sizes = [f"model.network.{each}" for each in (*small, "keypoints=0")]
     tiny = [*SMALL, "model=smolvla_tiny", "model.text.name=tokenizer", "trainer.max_steps=2", *sizes]
-    here(home, *tiny, "job=train", "output=first", "hydra.run.dir=first")
+    frozen, random = "learner.frozen=[network.vlm]", "learner.frozen=[network.vlm]: nothing trains their random weights"
+    assert random in here(home, *tiny, frozen, "job=train", "output=first", "hydra.run.dir=first").stdout
     to = ["export=lerobot_policy", "export.folder=published"]
     here(home, "job=export", "checkpoint=first", *to, "output=exported", "hydra.run.dir=exported")
     refused = here(home, *SMALL, "pretrained=published", "job=train", "output=bc", "hydra.run.dir=bc", ok=False)
     assert "as in model=smolvla" in refused.stderr
-    parts = ["pretrained=published", "learner.frozen=[network.vlm]", "learner/lora=low_rank"]
-    here(home, *tiny, *parts, "output=second", "hydra.run.dir=second", "evaluate.episodes=1")
+    parts = ["pretrained=published", frozen, "learner/lora=low_rank"]
+    second = here(home, *tiny, *parts, "output=second", "hydra.run.dir=second", "evaluate.episodes=1")
+    assert random not in second.stdout
     published, tuned = (load_file(home / name / "model.safetensors") for name in ("published", "second/policy"))
     name = "connector.modality_projection.proj.weight"
     theirs, ours = published[f"model.vlm_with_expert.vlm.model.{name}"], tuned.get(f"network.vlm.{name}")

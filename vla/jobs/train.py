@@ -24,6 +24,7 @@ from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.models.policy_folder import POLICY
 from vla.models.tokenizers.tokenization_error import out_of_bounds, rounding
+from vla.models.trunk import is_within, trunks
 from vla.parallel.limits import cores
 from vla.reports.observations import SHOWN, draw_samples
 from vla.reports.run_page import write_page
@@ -99,6 +100,8 @@ def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_s
     store, model = demonstrations(experiment), learner.model
     if origin is last is None:
         experiment.fit_tokenizer(model.tokenizer, store)
+        if random := [part for part in experiment["learner"]["frozen"] if not is_within(part, trunks(model))]:
+            log.warning("learner.frozen=[%s]: nothing trains their random weights", ", ".join(random))
     if last is None:
         model.fit(np.asarray(store.rows("state")), np.asarray(store.rows("action")))
     _warn_of_tokenization(model, [store, *(each for each in more if each.episodes)])

@@ -32,7 +32,9 @@ def fetch(name: str, *patterns: str, advice: str = "") -> Path:
         cached = {"local_files_only": reason is not None}
         return Path(snapshot_download(repository, revision=revision or None, allow_patterns=list(patterns), **cached))
     except (HfHubHTTPError, HFValidationError, OSError) as error:
-        if isinstance(error, (HfHubHTTPError, HFValidationError)):
+        if isinstance(error, HFValidationError):
+            reason = "models are called OWNER/NAME there"
+        elif isinstance(error, HfHubHTTPError):
             reason = f"it has no public model {repository}{f' at {revision}' if revision else ''}"
         reason = reason or str(error).partition("\n")[0]
         advice = advice and f"; {advice}"
