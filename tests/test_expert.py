@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 
 QUIET = {"start": 0.0, "noise": 0.0, "rate": 0.0, "unturned": 0.0, "missed": 0.0}
+# Of 24 episodes, three standard deviations below the shares of 48 that succeeded: 36 pushes, 41 stacks, at least 44 of
+# each other goal. Which ones do differs between processors, whose physics round differently.
+RECOVERED = {"push": 12, "stack": 15}
 GOALS = ("lift", "pick_place", "pick_place_two", "push", "stack", "stay", "wait")
 
 
@@ -42,8 +45,7 @@ def test_the_expert_solves_every_goal_even_when_it_is_led_astray(goal: str) -> N
         led_astray = perturbed(spec, noise=0.3)
         episodes = [rollout(environment, led_astray, seed) for seed in range(24)]
     environment.close()
-    # Which ones succeed differs between processors, whose physics round differently; of pushes and stacks about 19 do.
-    assert sum(episode.success for episode in episodes) >= 12
+    assert sum(episode.success for episode in episodes) >= RECOVERED.get(goal, 18)
     for actions in (episodes[0].actions, episodes[0].executed):
         assert (np.array(spec.low, np.float32) <= actions).all() and (actions <= np.array(spec.high, np.float32)).all()
     for observation, action in zip(episodes[0].observations, episodes[0].actions, strict=True):

@@ -228,6 +228,8 @@ def test_what_lerobot_cannot_build_is_not_exported(tmp_path: Path, tokenizer: Pa
     model = make_smolvla(tokenizer, network=partial(SmolVLA, **SMOLVLA | KEYPOINTS))
     with pytest.raises(UserError, match=r"sees no keypoints: train with model\.network\.keypoints=0"):
         LeRobotPolicyExporter(tmp_path / "published").export(as_policy(model, SPEC))
+    with pytest.raises(UserError, match=r"reads a sentence with a tokenizer: train with model\.text\.name"):
+        LeRobotPolicyExporter(tmp_path / "published").export(as_policy(make_smolvla(), SPEC))
     assert not [*tmp_path.iterdir()]
 
 
@@ -371,7 +373,8 @@ def test_a_published_policy_is_fine_tuned_and_evaluated_from_the_command_line(ho
     small = ("vision_layers=1", "layers=2", "resolution=32", "vocabulary=320", "vision_width=32", "vision_heads=1")
     sizes = [f"model.network.{each}" for each in (*small, "keypoints=0")]
     tiny = [*SMALL, "model=smolvla_tiny", "model.text.name=tokenizer", "trainer.max_steps=2", *sizes]
-    frozen, random = "learner.frozen=[network.vlm]", "learner.frozen=[network.vlm]: nothing trains their random weights"
+    frozen = "learner.frozen=[network.vlm]"
+    random = f"{frozen}: what is random in there stays random"
     assert random in here(home, *tiny, frozen, "job=train", "output=first", "hydra.run.dir=first").stdout
     to = ["export=lerobot_policy", "export.folder=published"]
     here(home, "job=export", "checkpoint=first", *to, "output=exported", "hydra.run.dir=exported")

@@ -101,7 +101,7 @@ def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_s
     if origin is last is None:
         experiment.fit_tokenizer(model.tokenizer, store)
         if random := [part for part in experiment["learner"]["frozen"] if not is_within(part, trunks(model))]:
-            log.warning("learner.frozen=[%s]: nothing trains their random weights", ", ".join(random))
+            log.warning("learner.frozen=[%s]: what is random in there stays random", ", ".join(random))
     if last is None:
         model.fit(np.asarray(store.rows("state")), np.asarray(store.rows("action")))
     _warn_of_tokenization(model, [store, *(each for each in more if each.episodes)])

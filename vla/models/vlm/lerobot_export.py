@@ -49,6 +49,8 @@ class LeRobotPolicyExporter:
         model = policy.model
         if not isinstance(model, VisionLanguageAction):
             raise UserError(f"LeRobot has no {type(model).__name__}: this export is of model=smolvla, pi0 and pi05")
+        if _prompt(model).name is None:
+            raise UserError("LeRobot reads a sentence with a tokenizer: train with model.text.name")
         beginnings = [(ours, theirs) for theirs, ours in model.network.published]
         state = model.network.state_dict()
         weights = {renamed(name, beginnings): tensor.detach().cpu().contiguous() for name, tensor in state.items()}
