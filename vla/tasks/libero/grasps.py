@@ -16,7 +16,7 @@ from vla.tasks.libero.situation import THIN, Situation
 WIDEST = 0.074  # of a thing between the open fingers [m]
 RIM = 0.012  # depth of a grasp below the edge of a wall [m]
 SHIFTS = ((0.01, 0.004), (0.03, -0.014))  # cost and offset of such a grasp towards the inside [m]
-FINGER, OPEN = 0.012, 0.037  # half of a finger's breadth; distance of an open finger from the middle [m]
+FINGER, OPEN, THICK = 0.012, 0.037, 0.02  # half of a finger's breadth, its distance from the middle, its depth [m]
 RIDGE = 0.02  # radius of what counts as the highest part of a thing [m]
 UPRIGHT = 0.9  # least cosine of the tilt of a thing that stands
 TOUCHING = 0.02  # room at which the hand most likely hits something [m]
@@ -154,8 +154,13 @@ def parts(pieces: Sequence[Array], alone: bool = True) -> Iterator[tuple[float, 
 
 def fits(grasp: Grasp, points: Array) -> bool:
     """Return whether the open fingers do not come down on the thing itself."""
+    return gap_of(grasp, points) > 0
+
+
+def gap_of(grasp: Grasp, points: Array) -> float:
+    """Return the gap between the open fingers that come down and the thing [m]; negative: they come down on it."""
     closing, along = axes(grasp.yaw)
     offset = points[:, :2] - grasp.position[:2]
     near = (np.abs(offset @ along) < FINGER) & (points[:, 2] > grasp.position[2] - TIP)
     aside = np.abs(offset[near] @ closing)
-    return not bool(((aside > OPEN) & (aside < OPEN + 0.02)).any())
+    return float(np.maximum(OPEN - aside, aside - OPEN - THICK).min(initial=np.inf))

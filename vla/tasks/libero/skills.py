@@ -7,7 +7,7 @@ import numpy as np
 
 from vla.spec import Array
 from vla.tasks.libero.controller import REACH
-from vla.tasks.libero.grasps import LEAN, TOUCHING, Grasp, fits, parts, room_of
+from vla.tasks.libero.grasps import LEAN, TOUCHING, Grasp, gap_of, parts, room_of
 from vla.tasks.libero.places import LOOSE, Place
 from vla.tasks.libero.room import HAND, TIP, axes
 from vla.tasks.libero.situation import THIN, Situation
@@ -17,6 +17,7 @@ TURN_GAIN = 1.0  # of the rotation to go: more is unstable where the arm folds u
 HOVER = 0.08  # height over a thing at which it is approached [m]
 NEAR, LEVEL, TURNED = 0.008, 0.008, 0.12  # tolerances of a grasp: across [m], in height [m], in yaw [rad]
 FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approaches come from above
+TURNED_ROOM = 0.05  # of a grasp, per angle by which it may be turned farther [m/rad]
 ROOM = 0.03  # largest distance across at which the hand comes down, if it touches nothing [m]
 MARGIN = 0.015  # height of open fingers over what they must not touch [m]
 FIRM = -0.9  # commanded opening at which they press as much as they can
@@ -33,8 +34,8 @@ UP = np.array([0.0, 0.0, 1.0])
 def approach(at: Situation, grasp: Grasp, points: Array, thing: str, opening: float = -1.0) -> Array:
     """Move to a grasp of points (N, 3) of a thing from above, along the hand, and close the fingers there.
 
-    The hand comes down where its fingers pass the thing, and corrects the rest meanwhile: if it had to be aligned
-    first, a centimetre, which a policy can hardly see, would decide between up and down.
+    The hand comes down where its fingers pass the thing, and corrects the rest meanwhile. The height changes gradually
+    with what room there is, so that no centimetre, which a policy can hardly see, decides between up and down.
     """
     grasp = alike(at, grasp)
     slope = np.array([*(-np.tan(grasp.lean) * axes(grasp.yaw)[1]), 1.0])  # of the line on which the hand comes
@@ -45,19 +46,26 @@ def approach(at: Situation, grasp: Grasp, points: Array, thing: str, opening: fl
     if away < NEAR and turn < TURNED and abs(height) < LEVEL:
         return command(at, grasp.position, grasp.yaw, 1.0, grasp.lean)
     own = points[:, 2].max() + TIP + MARGIN  # height at which the fingers are above the thing
-    aligned = away < NEAR and turn < TURNED
-    sinking = at.hand[2] < own - 0.01 and away < 1.6 * NEAR and turn < 1.6 * TURNED
-    room = max(min(room_of(at, thing, grasp) - TOUCHING, ROOM), NEAR)
-    between = away < room and turn < 1.6 * TURNED  # of what stands about
-    passing = between and fits(Grasp(grasp.position + offset, at.yaw, grasp.lean), points)
-    target = grasp.position.copy()
-    if (opening < 0 and at.opening < 0.5) or not (aligned or sinking or passing):
-        over = own + _funnel(away - NEAR)
-        if not between:
-            beside = at.others(thing, grasp.position, HAND)[:, 2].max(initial=-np.inf)
-            over = max(over, beside + TIP + MARGIN + _funnel(away - room))
-        target = target + (over - target[2]) * slope
+    here = Grasp(grasp.position + offset, at.yaw, grasp.lean)
+    aligned = (NEAR if at.hand[2] > own - 0.01 else 1.6 * NEAR) - away
+    turned = TURNED_ROOM * (1.6 * TURNED - turn)
+    # How far [m] the hand is from where it may not come down, past what stands about and past the thing itself.
+    beside = min(max(room_of(at, thing, here) - TOUCHING, aligned), ROOM - away, turned)
+    past = min(max(gap_of(here, points), aligned), beside)
+    if opening < 0 and at.opening < 0.5:
+        past = -ROOM
+    over = at.others(thing, grasp.position, HAND)[:, 2].max(initial=-np.inf) + TIP + MARGIN
+    heights = [lowest(at, own + _funnel(away - NEAR), past), lowest(at, over + _funnel(-beside), beside)]
+    target = grasp.position + max(0.0, *(height - grasp.position[2] for height in heights)) * slope
     return command(at, rising(at, target), grasp.yaw, opening, grasp.lean)
+
+
+def lowest(at: Situation, top: float, room: float) -> float:
+    """Return the least height of the hand [m] over a place whose obstacles have a top, with that much room in them.
+
+    Where there is room the hand sinks, the faster the more there is; where there is none, it rises to the top.
+    """
+    return min(top, float(at.hand[2]) - FUNNEL * room)
 
 
 def _funnel(distance: float) -> float:
@@ -88,10 +96,10 @@ def carry(at: Situation, thing: str, place: Place) -> Array:
     if close and offset[2] > -0.012 and abs(place.turn) < TURNED:
         return let_go(at, thing)
     away += 0.1 * abs(place.turn)
-    lift = min(FUNNEL * away, CARRY) if away > 0.6 * place.slack else 0.0
-    if away > max(place.slack, 0.015):
-        lift += max(0.0, _above(at, thing, place.spot))
-    return command(at, rising(at, at.hand + offset + lift * UP), yaw, 1.0, lean)
+    target = at.hand + offset + np.clip(FUNNEL * (away - 0.6 * place.slack), 0.0, CARRY) * UP
+    over = target[2] + max(0.0, _above(at, thing, place.spot))
+    target[2] = max(target[2], lowest(at, over, max(place.slack, 0.015) - away))
+    return command(at, rising(at, target), yaw, 1.0, lean)
 
 
 def let_go(at: Situation, thing: str) -> Array:
@@ -205,8 +213,8 @@ def push(at: Situation, thing: str) -> Array:
         return command(at, contact + 0.05 * ahead, pose.yaw, 1.0, pose.lean)
     grip = closing(at, tops(at))
     start = contact - 0.045 * ahead
-    if np.linalg.norm((at.hand - start)[:2]) > 0.012:
-        start[2] = max(tops(at), contact[2]) + 0.04
+    over = max(tops(at), contact[2]) + 0.04
+    start[2] = max(start[2], lowest(at, over, ROOM - float(np.hypot(*(at.hand - start)[:2]))))
     return command(at, rising(at, start), pose.yaw, grip, pose.lean)
 
 
