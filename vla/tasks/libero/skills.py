@@ -43,7 +43,8 @@ def approach(at: Situation, grasp: Grasp, points: Array, thing: str, opening: fl
     offset = (at.hand - grasp.position - max(height, 0.0) * slope) * (1, 1, 0)
     away = float(np.hypot(*offset[:2]))
     turn = max(abs(at.turn_to(grasp.yaw)), abs(at.lean - grasp.lean))
-    if away < NEAR and turn < TURNED and abs(height) < LEVEL:
+    loose = 1.0 if at.opening > 0.5 else 1.6  # fingers that have begun to close go on unless the hand is far off
+    if away < loose * NEAR and turn < loose * TURNED and abs(height) < loose * LEVEL:
         return command(at, grasp.position, grasp.yaw, 1.0, grasp.lean)
     own = points[:, 2].max() + TIP + MARGIN  # height at which the fingers are above the thing
     here = Grasp(grasp.position + offset, at.yaw, grasp.lean)
@@ -168,13 +169,12 @@ def pull(at: Situation, place: str) -> Array:
     if aside < 1.5 * NEAR and wrong < 2 * TURNED and abs(before) < 2 * LEVEL:
         grips = at.opening < FIRM and at.gap > THIN
         return move(at, middle + (0.012 if grips else 0.0) * way, rotation, 1.0)  # slowly, or the fingers slip
-    if aside < 2 * NEAR and wrong < 2 * TURNED and at.opening > 0.9:
-        return move(at, middle, rotation, -1.0)
     if at.upright and at.hand[2] < middle[2] - 0.03:
         return command(at, np.array([*at.hand[:2], middle[2]]), 0.0, -1.0)
     if before < 0.09 and at.hand[2] < tops(at) and wrong > 0.5:
         return move(at, at.hand + 0.05 * UP, rotation, -1.0)
-    return move(at, middle + 0.11 * way, rotation, -1.0)
+    room = min(2 * NEAR - aside, TURNED_ROOM * (2 * TURNED - wrong)) if at.opening > 0.9 else -ROOM
+    return move(at, middle + np.clip(before - FUNNEL * room, 0.0, 0.11) * way, rotation, -1.0)
 
 
 def twist(at: Situation, thing: str) -> Array:
