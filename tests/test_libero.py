@@ -23,7 +23,11 @@ from vla.tasks.libero.controller import Controller
 from vla.tasks.libero.environment import Libero
 from vla.tasks.libero.expert import Planner
 from vla.tasks.libero.goal import Goal
+from vla.tasks.libero.grasps import choose_grasp
 from vla.tasks.libero.package import SUITES, tasks_of
+from vla.tasks.libero.places import place_of
+from vla.tasks.libero.situation import Situation
+from vla.tasks.libero.skills import approach
 from vla.tasks.libero.starts import Starts, set_start
 
 REFERENCE = Path(__file__).with_name("libero_reference.npz")  # of robosuite, by tools/libero/excerpt.py
@@ -181,6 +185,28 @@ def _solved(environment: Libero, seed: int) -> Observation:
     assert environment.outcome == "success"
     assert np.array_equal(expert.act(seen), other.act(seen))  # which saw nothing of what was before
     return seen
+
+
+def test_no_millimetre_decides_whether_the_hand_goes_up_or_down() -> None:
+    with closing(world("task.suite=spatial", "task.tasks=[6]")) as environment, environment.blind():
+        expert, lines = Planner(spec=environment.spec), list[list[float]]()
+        seen, at = environment.reset(1), Situation(environment._task)
+        while not lines or at.opening > 0.5:  # until the fingers close
+            assert seen.truth is not None
+            at.take(seen.truth)
+            _, thing, where = at.goal.todo(at.data)[0]
+            grasp, hand = choose_grasp(at, thing, place_of(at, thing, where, False)), at.hand.copy()
+            assert grasp is not None
+            for way in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)):
+                heights = list[float]()
+                for millimetres in range(30):
+                    at.hand = hand + 0.001 * millimetres * np.array(way)
+                    heights.append(float(np.clip(approach(at, grasp, at.points(thing), thing)[2], -1, 1)))
+                lines.append(heights)
+            seen = environment.step(expert.act(seen))
+    steps = np.abs(np.diff(lines, axis=1))
+    assert np.ptp(lines) == 2  # from full speed down to full speed up
+    assert steps.max() < 1.2
 
 
 def test_the_planner_goes_on_from_where_another_agent_led() -> None:
