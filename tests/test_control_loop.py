@@ -488,6 +488,25 @@ def test_an_arm_that_executes_trajectories_of_its_own_stays_within_the_limits(wo
     assert sent < 50 and loop.motion.limiter.resting
 
 
+def test_an_arm_that_follows_each_trajectory_until_the_next_stays_within_the_limits_when_ticks_are_late(
+    world: World,
+) -> None:
+    loop, random, late = world.loop, np.random.default_rng(0), np.random.default_rng(1)
+    world.answer = lambda observation: random.uniform(SPEC.low, SPEC.high, (1, 7)).astype(np.float32)
+    path, sent = list[np.ndarray](), (world.now, [world.joints.copy()] * 2)
+    for command in world.ticks(3.0):
+        since, points = sent
+        at = (np.arange(since, world.now, 0.001) - since) * 50
+        path += list(np.stack([np.interp(at, range(len(points)), joints) for joints in np.transpose(points)], axis=1))
+        ahead = [each.position for each in loop.motion.ahead(command, world.now, 0.3)]
+        sent = world.now, [path[-1] if path else points[0], *ahead]
+        world.now += late.choice([0.0, 0.01, 0.02, 0.06], p=[0.7, 0.1, 0.1, 0.1])
+    speeds = np.diff(path, axis=0) / 0.001
+    assert 0.1 < np.abs(speeds).max() and (np.abs(speeds) <= 1.1 * ROBOT.max_speed).all()
+    # The commands of two ticks, of which the first was late, may come within one tick.
+    assert (np.abs(speeds[20:] - speeds[:-20]) <= 2.2 * ROBOT.max_acceleration * 0.02).all()
+
+
 SHORTER: Any = {name: getattr(ROBOT, name)[:6] for name in ("joints", "low", "high", "speed", "acceleration")}
 OTHER: Any = {"action": ("x", "y"), "units": ("m", "m"), "low": (0, 0), "high": (1, 1)}
 

@@ -30,7 +30,7 @@ from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.policy_node import PolicyNode
 from vla.deploy.ros import RosNetwork
 from vla.deploy.ros2 import PolicyDeployment
-from vla.deploy.safety import State
+from vla.deploy.safety import Safety, State
 from vla.deploy.settings import Topics
 from vla.robots.panda import HOME
 from vla.spec import Array, Observation
@@ -77,6 +77,7 @@ class World:
         gripper: Any = None,
         dry_run: bool = False,
         robot: JointLimits = ROBOT,
+        safety: Safety = SAFETY,
     ) -> None:
         RosNetwork("loopback", None, None).apply()
         self.contexts = [Context(), Context()]
@@ -90,7 +91,7 @@ class World:
             robot=robot,
             network=RosNetwork("loopback", None, None),
             topics=replace(TOPICS, images=topics),
-            safety=SAFETY,
+            safety=safety,
             **defaults_of("deploy/ros2", command=command, gripper=gripper, dry_run=dry_run),
             policy=nothing,
             environment=nothing,
@@ -114,6 +115,7 @@ class World:
         self.joints = HOME.copy()
         self.cameras, self.measures = list(SPEC.cameras), True
         self.changed: Callable[[Image], None] = lambda image: None
+        self.measured: Callable[[JointState], None] = lambda state: None
         self.clock = self.node.create_publisher(Clock, "/clock", 1)
         self.simulated: float | None = None  # simulated time [s], if any
 
@@ -141,7 +143,9 @@ class World:
                     self.joints = self.follow(self.joints)
                 elif self.commands:
                     self.joints = positions(self.commands[-1])[0]
-                self.states.publish(joint_state(self.joints))
+                measured = joint_state(self.joints)
+                self.measured(measured)
+                self.states.publish(measured)
             if tick % 5 == 0:
                 for camera in self.cameras:
                     image = messages.fill_image(Image(), np.zeros((8, 8, 3), np.uint8), camera)

@@ -56,8 +56,8 @@ class ArmOutput:
         return message
 
     def _trajectory(self, command: Command, now: float) -> JointTrajectory:
-        """A trajectory of which the next one replaces all points after the first."""
-        return trajectory(self._loop.limits, [command, *self._loop.motion.horizon(now, AHEAD)], self._loop.tick)
+        """A trajectory that the next one replaces."""
+        return trajectory(self._loop.limits, self._loop.motion.ahead(command, now, AHEAD), self._loop.tick)
 
     def _positions(self, command: Command, now: float) -> Float64MultiArray:
         return Float64MultiArray(data=command.position.tolist())

@@ -71,6 +71,7 @@ class ControlLoop:
         self.state, self.reason = State.WAITING, "no joint state yet"
         self.instruction, self._instructed_at, self._said_at = "", 0.0, -np.inf
         self.late_plans, self.rejections, self.handed_over = 0, 0, False
+        self.obstacle = ""  # why the arm is held until this is empty again, beside what is seen here
         self.motion = Motion(self.limits, self.tick, 1 / self.spec.control_hz, self.goals.workspace)
         self._observer, self._tracking = Observer(self.spec), Tracking(self.safety, self._follows_positions)
         self._pending: _Pending | None = None
@@ -269,7 +270,7 @@ class ControlLoop:
 
     def _input_problem(self, newest: Measured, now: float) -> str:
         """Describe which input or inference is overdue; empty if none is."""
-        if problem := self._observer.image_problem(now, self.safety.image_age):
+        if problem := self.obstacle or self._observer.image_problem(now, self.safety.image_age):
             return problem
         if now - newest.at > self.safety.joints_age:
             return f"the newest joint state is older than {self.safety.joints_age} s"

@@ -15,7 +15,7 @@ from vla.deploy import messages
 from vla.deploy.control_loop import ControlLoop
 from vla.deploy.diagnostics import Diagnostics
 from vla.deploy.lifecycle_node import GuardedLifecycleNode
-from vla.deploy.observer import age_of
+from vla.deploy.observer import OLDEST, age_of
 from vla.deploy.settings import COMPRESSED, PolicySettings
 from vla.io.errors import UserError
 from vla.spec import LONGEST_INSTRUCTION
@@ -35,7 +35,8 @@ class Inputs:
         """Args: the node; its loop, settings and diagnostics; `advance` is called after an image."""
         self._node, self._loop, self._diagnostics, self._advance = node, loop, diagnostics, advance
         self._joint_states = messages.JointStates(loop.limits)
-        self._stamps: dict[str, tuple[int, int]] = {}  # camera → time stamp of its last image
+        self._stamps: dict[str, tuple[int, int]] = {}  # what is stamped → its last time stamp
+        self._synchronised: set[str] = set()  # of these, those whose clock has been that of this node
         topics = settings.topics
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # matches every publisher
         for camera in loop.spec.cameras:
@@ -46,15 +47,11 @@ class Inputs:
         node.add_subscription(String, topics.instruction, self._on_instruction, QoSProfile(depth=1))
 
     def _on_image(self, camera: str, message: Any) -> None:
-        now = time.monotonic()
-        stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
-        age = age_of(stamp, self._node.get_clock().now().nanoseconds * 1e-9)  # now: decoding takes its time
         if not self._node.active:
             return
+        now = time.monotonic()
         try:
-            if stamp != (0, 0) and stamp == self._stamps.get(camera):
-                raise UserError("two images have the same time stamp: is its clock frozen?")
-            self._stamps[camera] = stamp
+            age = self._age(camera, message)  # first: decoding takes its time
             image = messages.image_from(message)
         except UserError as error:
             return self._diagnostics.drop(f"camera {camera}: {error}")
@@ -62,16 +59,33 @@ class Inputs:
         self._loop.on_image(camera, image, now - age)
         self._advance()
 
+    def _age(self, source: str, message: Any) -> float:
+        """Return the age of a message [s] by its time stamp, 0 if that is of another clock (UserError: the clock is
+        frozen, or the message is older than any of another clock would be)."""
+        stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
+        if stamp == (0, 0):
+            return 0.0
+        if stamp == self._stamps.get(source):
+            raise UserError("two messages have the same time stamp: is its clock frozen?")
+        self._stamps[source] = stamp
+        now = self._node.get_clock().now().nanoseconds * 1e-9
+        if (age := now - (stamp[0] + stamp[1] * 1e-9)) >= OLDEST and source in self._synchronised:
+            raise UserError(f"its time stamp is {age:.0f} s old")
+        if 0 <= age < OLDEST:
+            self._synchronised.add(source)
+        return age_of(stamp, now)
+
     def _on_joint_state(self, message: JointState) -> None:
         now = time.monotonic()
         if not self._node.active:
             return
         try:
             measured = self._joint_states.read(message, now)
+            age = self._age("fingers" if measured is None else "arm", message)
         except UserError as error:
-            return self._diagnostics.drop(str(error))
+            return self._diagnostics.drop(f"joint states: {error}")
         if measured is not None:
-            self._loop.on_joint_state(*measured, now)
+            self._loop.on_joint_state(*measured, now - age)
 
     def _on_instruction(self, message: String) -> None:
         if not self._node.active:

@@ -81,6 +81,12 @@ class Goals:
             raise UserError(
                 f"the policy was trained with {len(model.joints)} joints, the robot has {len(limits.joints)}"
             )
+        for ours, theirs in zip(model.joints, limits.joints, strict=True):
+            if ours != theirs and ours in limits.joints:
+                raise UserError(
+                    f"the policy has {ours} where deploy.robot.joints has {theirs}: list joints and limits of the "
+                    f"robot in the policy's order, {', '.join(model.joints)}"
+                )
         if model.gripper in spec.state and not limits.fingers:
             raise UserError("the policy sees how far its gripper is open: name the joints in deploy.robot.fingers")
         self._spec, self._gripper = spec, gripper_index(spec)
@@ -123,7 +129,8 @@ class Motion:
         self.schedule = Schedule[Waypoint](period)
         self._opening: float | None = 1.0
         self._commanded: deque[tuple[float, Array]] = deque()  # at, joints
-        # Trajectory that an arm executes by itself: since when, its commands, and whether it is still to be followed.
+        # Trajectory that an arm executes by itself: since when, the state before it and its commands, and whether it is
+        # still to be followed.
         self._sent: tuple[float, list[Command]] | None = None
         self._sent_valid = False
 
@@ -147,7 +154,7 @@ class Motion:
     def follow(self, plan: list[Waypoint], position: Array | None = None) -> None:
         """Replace what is planned; the first goal is approached from the commanded position, or from another (J,)."""
         if position is not None:
-            self.limiter.position = np.array(position, float)
+            self.limiter.position, self._sent = np.array(position, float), None
         self.schedule, self._sent_valid = Schedule[Waypoint](self._period), False
         if plan:
             self.schedule.add(plan, plan[0][0] - self._period)
@@ -161,6 +168,7 @@ class Motion:
         if self._sent is not None:
             self._recall(*self._sent, now)
         if not self._sent_valid:
+            self._before = _command(self.limiter, self._opening)
             self._opening = self._step(self.limiter, now, self._opening)
         self._record(now)
         return _command(self.limiter, self._opening)
@@ -190,8 +198,17 @@ class Motion:
         """
         if self._sent_valid:
             return None
-        ahead = [command, *self.horizon(now)]
-        self._sent, self._sent_valid = (now, ahead), True
+        ahead = self.ahead(command, now)
+        self._sent_valid = True
+        return ahead
+
+    def ahead(self, command: Command, now: float, longest: float = math.inf) -> list[Command]:
+        """Return the trajectory from this command to rest, which the arm follows until it is sent another one.
+
+        The next command goes on from where the arm is on it by then, though that tick is late. Args: as of `horizon`.
+        """
+        ahead = [command, *self.horizon(now, longest)]
+        self._sent = now, [self._before, *ahead]
         return ahead
 
     def _recall(self, since: float, ahead: list[Command], now: float) -> None:
@@ -199,10 +216,11 @@ class Motion:
 
         It is that of this tick while the trajectory is valid, else that of the previous tick, because a step follows.
         """
-        ticks = round((now - since) / self.tick) - (not self._sent_valid)
-        planned = ahead[min(max(ticks, 0), len(ahead) - 1)]
-        self.limiter.position, self.limiter.velocity = planned.position.copy(), planned.velocity.copy()
-        self._opening = planned.opening
+        ticks = min(max(round((now - since) / self.tick, 6) + self._sent_valid, 0.0), len(ahead) - 1.0)
+        before, after, share = ahead[math.floor(ticks)], ahead[math.ceil(ticks)], ticks % 1
+        self.limiter.position = before.position + share * (after.position - before.position)
+        self.limiter.velocity = after.velocity.copy()  # with which a command is approached
+        self._opening = before.opening
 
     def _step(self, limiter: JointLimiter, now: float, opening: float | None) -> float | None:
         """Move towards the next goal within limits and workspace, or brake; returns the opening to command."""

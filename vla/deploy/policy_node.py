@@ -147,8 +147,10 @@ class PolicyNode(GuardedLifecycleNode):
         return response
 
     def _on_resume(self, request: Any, response: Any) -> Any:
-        response.success = self.loop is not None and self.active and self.loop.resume(time.monotonic())
-        response.message = "" if response.success else "nothing to resume: the agent is not stopped"
+        loop = self.loop if self.active else None
+        going = (State.RUNNING, State.HOLDING)  # an instruction that came before has ended a stop by time-out
+        response.success = loop is not None and (loop.resume(time.monotonic()) or loop.state in going)
+        response.message = "" if response.success else f"nothing to resume: {loop.reason if loop else 'inactive'}"
         return response
 
     def _on_hand_over(self, request: Any, response: Any) -> Any:
@@ -214,8 +216,8 @@ class PolicyNode(GuardedLifecycleNode):
         commands = self._arm.publisher.topic_name
         if self.count_publishers(commands) > 1 and not self.loop.handed_over:
             self.loop.fail(f"another node commands the arm on {commands}")
-        for camera in self.policy.spec.cameras:
-            topic = self.resolve_topic_name(self.settings.topics.images[camera])
-            if (count := self.count_publishers(topic)) > 1:
-                self.loop.hold(f"{count} publishers send images on {topic}")
+        topics = {self.resolve_topic_name(self.settings.topics.images[camera]) for camera in self.policy.spec.cameras}
+        counts = {topic: self.count_publishers(topic) for topic in sorted(topics)}
+        several = [f"{count} publishers send images on {topic}" for topic, count in counts.items() if count > 1]
+        self.loop.obstacle = ", ".join(several)
         self.diagnostics.report()

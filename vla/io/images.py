@@ -75,5 +75,7 @@ def decode_image(content: bytes, size: tuple[int, int] | None = None) -> Array:
             return np.array(image.convert("RGB"))
     except UnidentifiedImageError as error:  # whose text has an address in memory
         raise UserError(f"the image cannot be decoded: it is not {' or '.join(FORMATS)}") from error
-    except (OSError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError) as error:
+    except UserError:
+        raise
+    except (OSError, ValueError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError) as error:
         raise UserError(f"the image cannot be decoded ({str(error)[:200]})") from error

@@ -128,7 +128,7 @@ class RemotePolicy:
         self.history = history or 1  # frames of a window; above 1 every observation is sent
         # Plans come back as they were sent, which a mapping of actions cannot do.
         self.chunking = self.metadata.get("chunking") is True and self.actions is None
-        self._wanted = self._configured_execute or (1 if self.history > 1 else advertised)
+        self.execute = self._wanted = self._configured_execute or (1 if self.history > 1 else advertised)
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode: drop all chunks, connect again if that broke, and tell a server that has episodes."""
