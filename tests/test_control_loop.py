@@ -502,7 +502,7 @@ def test_an_arm_that_follows_each_trajectory_until_the_next_stays_within_the_lim
         sent = world.now, [path[-1] if path else points[0], *ahead]
         world.now += late.choice([0.0, 0.01, 0.02, 0.06], p=[0.7, 0.1, 0.1, 0.1])
     speeds = np.diff(path, axis=0) / 0.001
-    assert 0.1 < np.abs(speeds).max() and (np.abs(speeds) <= 1.1 * ROBOT.max_speed).all()
+    assert np.abs(speeds).max() > 0.1 and (np.abs(speeds) <= 1.1 * ROBOT.max_speed).all()
     # The commands of two ticks, of which the first was late, may come within one tick.
     assert (np.abs(speeds[20:] - speeds[:-20]) <= 2.2 * ROBOT.max_acceleration * 0.02).all()
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from vla.deploy.record import BagRecorder
+from vla.deploy.ros import arguments as ros_arguments
 from vla.deploy.ros import plain_errors, ros
 from vla.deploy.ros2 import PolicyDeployment, SimulatorDeployment
 from vla.io.errors import UserError
@@ -75,7 +76,9 @@ class Loop:
                 "deploy=loop: the simulator obeys deploy.agent.command=joint_state only, without deploy.agent.dry_run"
             )
         context = get_context("spawn")
-        processes = [context.Process(target=_run, args=(node,), daemon=True) for node in (agent, simulator)]
+        processes = [
+            context.Process(target=_run, args=(node, ros_arguments), daemon=True) for node in (agent, simulator)
+        ]
         for process in processes:
             process.start()
         try:
@@ -98,8 +101,9 @@ class Loop:
                 process.kill()
 
 
-def _run(node: PolicyDeployment | SimulatorDeployment) -> None:
-    """Run a node in its own process; user errors exit with one sentence."""
+def _run(node: PolicyDeployment | SimulatorDeployment, given: list[str]) -> None:
+    """Run a node in its own process, with arguments of ROS; user errors exit with one sentence."""
+    ros_arguments[:] = given
     leave_with_parent()
     without_triton()
     with plain_errors():

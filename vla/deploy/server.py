@@ -40,6 +40,7 @@ from vla.spec import Array, Environment, Observation
 if TYPE_CHECKING:
     from vla.policy import Policy
 
+FULL = "{} clients are connected: raise deploy.connections, or lower their cluster.workers\n"
 PATIENCE = 3.0  # with clients that open or close a connection [s]
 INVALID, TOO_BIG, INTERNAL = 1007, 1009, 1011  # WebSocket close codes: invalid data, too large, error in the server
 
@@ -157,7 +158,7 @@ class Service:
         ):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "send the API key as Authorization: Api-Key …\n")
         if len(self._lanes) >= self._settings.connections:
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{len(self._lanes)} clients are connected\n")
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, FULL.format(len(self._lanes)))
         return None
 
     async def _talk(self, connection: ServerConnection) -> None:

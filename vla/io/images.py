@@ -77,5 +77,13 @@ def decode_image(content: bytes, size: tuple[int, int] | None = None) -> Array:
         raise UserError(f"the image cannot be decoded: it is not {' or '.join(FORMATS)}") from error
     except UserError:
         raise
-    except (OSError, ValueError, SyntaxError, EOFError, struct.error, zlib.error, Image.DecompressionBombError) as error:
+    except (
+        OSError,
+        ValueError,
+        SyntaxError,
+        EOFError,
+        struct.error,
+        zlib.error,
+        Image.DecompressionBombError,
+    ) as error:
         raise UserError(f"the image cannot be decoded ({str(error)[:200]})") from error
