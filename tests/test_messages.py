@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from types import SimpleNamespace
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -81,7 +82,15 @@ def test_a_compressed_image_is_decoded(kind: str, mode: str) -> None:
     assert found.shape == (40, 30, 3) and np.abs(found.astype(int) - picture).max() <= 2
 
 
-@pytest.mark.parametrize("damage", [lambda whole: b"", lambda whole: whole[:-40], lambda whole: b"GIF89a" + whole])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: b"",
+        lambda whole: whole[:-40],
+        lambda whole: b"GIF89a" + whole,
+        lambda whole: whole[:33] + b"\0\0\0\3pHYs\0\0\1" + crc32(b"pHYs\0\0\1").to_bytes(4, "big") + whole[33:],  # cut short
+    ],
+)
 def test_a_compressed_image_that_is_none_is_refused(damage: Any) -> None:
     data, depth = io.BytesIO(), io.BytesIO()
     Image.fromarray(np.zeros((4, 5), np.uint16)).save(depth, "PNG")

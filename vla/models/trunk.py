@@ -83,14 +83,21 @@ def require_trunks(model: nn.Module, named: Mapping[str, Source], policy: object
 
 
 def whole_state(model: nn.Module, state: Mapping[str, Any], named: Collection[str]) -> dict[str, Any]:
-    """Return the state of a policy with that of the trunks it names, to which their factors of LoRA are added."""
+    """Return the state of a policy with that of the trunks it names, to which their factors of LoRA are added.
+
+    The model forgets the source of every module that this state makes something else than what came from there.
+    """
     whole = {name: value for name, value in state.items() if not (is_factor(name) and is_within(name, named))}
+    changed = set[str]()  # linear maps
     for part in named:
-        module: Any = model.get_submodule(part)
-        for name, value in module.state_dict(prefix=f"{part}.").items():
+        for name, value in model.get_submodule(part).state_dict(prefix=f"{part}.").items():
             layer = name.removesuffix(".weight")
             if f"{layer}.lora_A" in state:
                 value = value + state[f"{layer}.lora_B"] @ state[f"{layer}.lora_A"]
-                module.source = None  # it is no longer what came from there
+                changed.add(layer)
             whole[name] = value
+    for name, module in model.named_modules():
+        unchanged = is_within(name, named) and not any(is_within(layer, [name]) for layer in changed)
+        if isinstance(getattr(module, "source", None), Source) and not unchanged:
+            module.source = None  # type: ignore[assignment]
     return whole

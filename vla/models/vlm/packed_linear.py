@@ -11,25 +11,19 @@ from weakref import WeakKeyDictionary
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.optim.optimizer import register_optimizer_step_post_hook
 from transformers.activations import GELUTanh
 from transformers.models.siglip.modeling_siglip import SiglipMLP
 from transformers.models.smolvlm.modeling_smolvlm import SmolVLMVisionMLP
 
 Packed = tuple[tuple[int, int], Tensor]  # address and version of a weight, and the weight in another layout
 PACKED: WeakKeyDictionary[nn.Module, Packed] = WeakKeyDictionary()  # no part of modules, which are saved and copied
+# Fused optimisers do not tell by a weight's version that they change it.
+register_optimizer_step_post_hook(lambda *_: PACKED.clear())
 
 
 class PackedLinear(nn.Linear):
-    """`nn.Linear` with the same parameters, which has its weight in another layout, too, once it acted in float32.
-
-    Fused optimisers do not tell that they change a weight: so the other layout is dropped when a training goes on.
-    """
-
-    def train(self, mode: bool = True) -> PackedLinear:
-        """Drop the other layout before a training."""
-        if mode:
-            PACKED.pop(self, None)
-        return super().train(mode)
+    """`nn.Linear` with the same parameters, which has its weight in another layout, too, once it acted in float32."""
 
     def forward(self, input: Tensor) -> Tensor:
         """Map (…, inputs) to (…, outputs)."""
