@@ -94,14 +94,14 @@ def train_trunk(store: Path, folder: Path, batch_size: int, **trainer: Any) -> d
         store, history=1, chunk=model.chunk, tokenize=model.text.tokenize, batch_size=batch_size, validation_windows=16
     )
     made.fit(learner, datamodule=data)
-    for name in (LAST, POLICY):
+    for name in (LAST, POLICY, POLICY):  # that of a training that goes on takes the place of the one before
         made.save_checkpoint(folder / name, weights_only=False)
     return {name: value.item() for name, value in made.callback_metrics.items() if name.startswith("val/")}
 
 
 def train_trunks(store: Path, folder: Path) -> None:
     """Leave what two processes find that share the weights of every layer of a trunk."""
-    strategy = {"_target_": "lightning.pytorch.strategies.ModelParallelStrategy", "save_distributed_checkpoint": False}
+    strategy = {"_target_": "vla.training.checkpoints.Sharded"}
     found = train_trunk(store, folder / TRUNK, 8, devices=2, strategy=strategy)
     torch.save(found, folder / TRUNK / "found.pt")
 

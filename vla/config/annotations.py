@@ -36,7 +36,6 @@ LIBRARY = (
     "lightning.pytorch.loggers.MLFlowLogger",
     "lightning.pytorch.loggers.TensorBoardLogger",
     "lightning.pytorch.loggers.WandbLogger",
-    "lightning.pytorch.strategies.ModelParallelStrategy",
 )
 
 SCALARS = (bool, int, float, str, types.NoneType)

@@ -17,6 +17,7 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins import TorchCheckpointIO
+from lightning.pytorch.strategies import ModelParallelStrategy, Strategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from vla.io.errors import UserError
@@ -153,3 +154,14 @@ class AtomicCheckpointIO(TorchCheckpointIO):
                     raise error.__context__ from None
                 raise
             os.fsync(file.fileno())
+
+
+class Sharded(ModelParallelStrategy):
+    """Lightning's FSDP2, whose checkpoints are single files and policies folders, as without sharding."""
+
+    def __init__(self) -> None:
+        super().__init__(save_distributed_checkpoint=False)
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], filepath: Any, storage_options: Any = None) -> None:
+        """Write what all processes have gathered; Lightning would refuse the folder of a policy that is there."""
+        Strategy.save_checkpoint(self, checkpoint, filepath, storage_options)
