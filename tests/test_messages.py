@@ -88,7 +88,9 @@ def test_a_compressed_image_is_decoded(kind: str, mode: str) -> None:
         lambda whole: b"",
         lambda whole: whole[:-40],
         lambda whole: b"GIF89a" + whole,
-        lambda whole: whole[:33] + b"\0\0\0\3pHYs\0\0\1" + crc32(b"pHYs\0\0\1").to_bytes(4, "big") + whole[33:],  # cut short
+        lambda whole: (
+            whole[:33] + b"\0\0\0\3pHYs\0\0\1" + crc32(b"pHYs\0\0\1").to_bytes(4, "big") + whole[33:]
+        ),  # cut short
     ],
 )
 def test_a_compressed_image_that_is_none_is_refused(damage: Any) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor
 from vla.config.compose import compose
 from vla.io.errors import UserError
 from vla.models.vlm.network import renamed
+from vla.models.vlm.policy import last_of
 from vla.models.vlm.prompt import PADDING
 
 TOLERANCE = 1e-5
@@ -109,3 +110,14 @@ def test_it_trains_and_is_evaluated_and_saved_like_any_other_model(name: str, ho
     here(home, *SMALL, f"model={name}", *network, *tiny, f"output={name}", f"hydra.run.dir={name}")
     assert json.loads((home / name / "policy/config.json").read_text())["model"]["chunk"] == 8
     assert (home / name / "policy/model.safetensors").is_file() and list((home / name).rglob("report.json"))
+
+
+def test_what_actions_see_of_a_prompt_does_not_end_with_its_padding(tmp_path: Path) -> None:
+    model = make_policy("pi05", write_tokenizer(tmp_path))
+    take_statistics(model)
+    with torch.no_grad():
+        together = model.known(batch_of(model))
+    lengths = together.present.sum(1)
+    assert lengths[0] != lengths[1]
+    for number, seen in enumerate(last_of(together)):
+        assert torch.equal(seen, together.values[-1][number, :, lengths[number] - 1].flatten())

@@ -103,6 +103,12 @@ def test_resuming_at_a_validation_step_keeps_its_validation(
     assert logged(tmp_path / "half") == logged(tmp_path / "whole") != []
 
 
+def test_a_policy_has_the_figures_of_a_validation_before_the_interruption(folder: Path, tmp_path: Path) -> None:
+    half = train(make_bc(), folder, tmp_path, stop=VALIDATED + 1, max_steps=VALIDATED + 2)
+    rest = train(make_bc(), folder, tmp_path, checkpoint=tmp_path / "checkpoints/last.ckpt", max_steps=VALIDATED + 2)
+    assert rest["figures"] == half["figures"] != {}
+
+
 def test_gradients_that_are_gathered_over_batches_are_not_cut_in_half(folder: Path, tmp_path: Path) -> None:
     torch.manual_seed(0)
     model = make_bc()

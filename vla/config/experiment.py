@@ -11,7 +11,6 @@ from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from vla.config.annotations import locate
@@ -244,7 +243,7 @@ class Experiment:
         learner = self.learner(store.spec, origin)
         if origin is None:
             self.fit_tokenizer(learner.model.tokenizer, store)
-        learner.model.fit(np.asarray(store.rows("state")), np.asarray(store.rows("action")))
+        learner.model.fit(store.numbers("state"), store.numbers("action"))
         return learner
 
     def data(
@@ -326,7 +325,12 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
 
 def training_policy(precision: str, model: Model) -> Policy:
     """Build the policy of a model in training, on the model's device and without a second compilation or an export."""
-    here = {"device": next(model.parameters()).device.type, "precision": precision, "compile": False, "lanes": 1}
+    device = next(model.parameters()).device
+    if device.type == "cuda":  # in a worker process, too, that of the model
+        import torch
+
+        torch.cuda.set_device(device)
+    here = {"device": device.type, "precision": precision, "compile": False, "lanes": 1}
     return build({"_target_": "vla.policy.Policy", **here}, "policy", model=model, spec=model.spec)
 
 

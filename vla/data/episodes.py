@@ -145,10 +145,12 @@ class EpisodeStore:
     def statistics(self) -> Statistics:
         """Bounds and a sample of the actions in `episodes`; a UserError if there are none, or if they are damaged."""
         self.require_episodes()
-        actions = self.rows("action")
-        self.verify(self.episodes, {"action": actions})
-        ends = np.array([entry.end for entry in self.episodes])
-        return Statistics(np.asarray(actions)[: ends[-1]], ends)
+        self.verify(self.episodes, {"action": self.rows("action")})
+        return Statistics(self.numbers("action"), np.array([entry.end for entry in self.episodes]))
+
+    def numbers(self, field: str) -> Array:
+        """Return the rows of a field of numbers in `episodes`, (N, …); there may be more in the store."""
+        return np.asarray(self.rows(field))[: self.episodes[-1].end]
 
     def rows(self, field: str, scattered: bool = False) -> Rows:
         """Return all committed rows of `field`, (N, …), which are read when they are indexed.

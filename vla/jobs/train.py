@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 
 import lightning
-import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
 
@@ -43,7 +42,7 @@ from vla.runs.resume import first_process, training_lock, training_progress
 from vla.training.checkpoints import GracefulStop
 from vla.training.closed_loop import ClosedLoop
 from vla.training.estimate import Estimate
-from vla.training.trainer import explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
+from vla.training.trainer import end_wandb, explain_memory_errors, make_trainer, quiet_lightning, restore_metrics
 
 log = logging.getLogger(__name__)
 
@@ -103,7 +102,7 @@ def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_s
         if random := [part for part in experiment["learner"]["frozen"] if not is_within(part, trunks(model))]:
             log.warning("learner.frozen=[%s]: what is random in there stays random", ", ".join(random))
     if last is None:
-        model.fit(np.asarray(store.rows("state")), np.asarray(store.rows("action")))
+        model.fit(store.numbers("state"), store.numbers("action"))
     _warn_of_tokenization(model, [store, *(each for each in more if each.episodes)])
     data = _windows(experiment, store, model, trainer)
     if last:
@@ -225,4 +224,5 @@ def _reported(
             save_training(output, Training(*size, ended, origins))
             with warn_on_error(output / PAGE):
                 write_page(output)
+        end_wandb()
     log.info("trained %d steps in %.0f s", trainer.global_step, graceful_stop.seconds)

@@ -82,7 +82,7 @@ class Learner(LightningModule):
         if checkpointing:
             recompute_layers(model)
         self._groups()  # names of unknown parts are refused now, and frozen ones are frozen before they are distributed
-        self._trunks = trunks(model)
+        self._trunks, self._figures = trunks(model), dict[str, float]()
         modules = dict(model.named_modules())
         for name in modules.keys() & {*self._trunks, *frozen}:  # what is frozen may also be a single parameter
             evaluate_frozen(modules[name])
@@ -223,7 +223,12 @@ class Learner(LightningModule):
         checkpoint["trunks"] = {name: asdict(source) for name, source in self._trunks.items()}
         checkpoint["lora_scale"] = self._scale
         measured = self.trainer.callback_metrics.items()
-        checkpoint["figures"] = {name: float(value) for name, value in measured if name.startswith("val/")}
+        found = {name: float(value) for name, value in measured if name.startswith("val/")}
+        checkpoint["figures"] = self._figures = found or self._figures
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Restore the figures of the last validation, for a policy that is saved before the next one."""
+        self._figures = checkpoint["figures"]
 
 
 def _set_precision(flash: bool, precision: str) -> None:

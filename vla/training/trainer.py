@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import platform
+import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -195,3 +196,9 @@ def quiet_lightning() -> None:
     # Warnings about its own callbacks and hooks, which users cannot change.
     warnings.filterwarnings("ignore", module=r"lightning\.")
     warnings.filterwarnings("ignore", "FSDP2-wrapped module .* returned a view")  # not written to here
+
+
+def end_wandb() -> None:
+    """End the run of Weights & Biases, or the next training of this process, of a sweep or a round, goes on in it."""
+    if wandb := sys.modules.get("wandb"):
+        wandb.finish()

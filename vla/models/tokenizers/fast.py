@@ -32,7 +32,7 @@ class Fast(ActionTokenizer):
     varies, up to k·D tokens and an end token. A generated sequence with too few coefficients is filled up with 0, one
     with too many is cut.
 
-    A chunk counts in the loss as a whole, and only if its first action is valid.
+    A chunk counts in the loss as a whole, and only if nothing in it is perturbed.
 
     Args:
         bins: K: the end token, one token per coefficient value, and merged sequences.

@@ -176,7 +176,7 @@ class VisionLanguageAction(Model):
             executed = self.scaled(batch["executed"][:, -1]).repeat(copies, 1, 1)
             noisy, progress = with_prefix(noisy, 1 - time, executed, batch["length"])
             time = 1 - progress
-        truth = self.predict_truth(known.values[-1][:, :, -1].flatten(1).unsqueeze(1))
+        truth = self.predict_truth(last_of(known).unsqueeze(1))
         return {"velocity": self.network.velocity(prefix, noisy, time), "target": noise - action, **truth}
 
     def scaled(self, action: Tensor) -> Tensor:
@@ -202,6 +202,13 @@ class VisionLanguageAction(Model):
         for step in range(self.steps):
             x = x + velocity(x, x.new_full((len(x),), step / self.steps)) / self.steps
         return Prediction(self.action_normalizer.inverse(x[..., : len(self.spec.action)]))
+
+
+def last_of(known: Prefix) -> Tensor:
+    """Return what actions see of the last token of every prefix in the last layer, (B, C): padding may follow it."""
+    places = torch.arange(known.present.shape[1], device=known.present.device)
+    last = (known.present * places).argmax(1)
+    return known.values[-1][torch.arange(len(last), device=last.device), :, last].flatten(1)
 
 
 def resize_with_padding(images: Tensor, size: int, place: Place) -> Tensor:
