@@ -246,13 +246,18 @@ class Ending(toy.ToyEnvironment):
 
 
 @pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])
-def test_validation_finds_the_same_with_any_number_of_workers(make: Callable[[], Model], tmp_path: Path) -> None:
+def test_validation_finds_the_same_with_any_number_of_workers(
+    make: Callable[[], Model], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     learner, seeds = make_learner(make()), range(FIRST_SEED, FIRST_SEED + 5)
     torch.backends.cuda.enable_flash_sdp(True)  # as in a new process, whatever an interrupted training before left
     learner.on_fit_start()  # what a training sets must not matter
     try:
         with ClosedLoop(Ending, as_policy, seeds, tmp_path, workers=2) as closed_loop:
-            alone = closed_loop.play(learner, seeds, 1)
+            with monkeypatch.context() as changed:
+                changed.setattr("vla.training.closed_loop.memory_of", lambda device: (0.0, 5e6))  # for no second model
+                alone = closed_loop.play(learner, seeds, 2)
+                assert closed_loop._pool is None
             shared = closed_loop.play(learner, seeds, 2)
             for parameter in learner.model.parameters():
                 parameter.data.mul_(-1)

@@ -22,9 +22,11 @@ from vla.rollouts.evaluate import play_episode
 from vla.rollouts.results import ERROR, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import Agent, Environment
+from vla.training.device import memory_of
 
 log = logging.getLogger(__name__)
 
+ROOM = 3  # memory that a model needs in a process of its own, in that of its weights: it arrives, and acts
 PER_WORKER = 5  # episodes; for fewer, a process takes longer to start than they take
 
 
@@ -121,8 +123,11 @@ class ClosedLoop(Callback):
     def play(self, learner: Learner, seeds: Sequence[int], workers: int) -> list[Result]:
         """Return the results of the episodes of seeds with the weights of now.
 
-        They are played in so many worker processes, or in this one if there would be only one.
+        They are played in so many worker processes, as far as there is memory for a model in each, or in this one if
+        there would be only one.
         """
+        size = sum(weight.nbytes for weight in learner.model.parameters())
+        workers = min(workers, int(memory_of(learner.device)[1] / (ROOM * size)))
         with one_thread_each():
             if workers <= 1:
                 with learner.evaluating():
