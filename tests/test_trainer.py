@@ -255,7 +255,7 @@ def test_validation_finds_the_same_with_any_number_of_workers(
     try:
         with ClosedLoop(Ending, as_policy, seeds, tmp_path, workers=2) as closed_loop:
             with monkeypatch.context() as changed:
-                changed.setattr("vla.training.closed_loop.memory_of", lambda device: (0.0, 5e6))  # for no second model
+                changed.setattr("vla.training.closed_loop.memory_of", lambda device: (0.0, 1e4))  # for no other model
                 alone = closed_loop.play(learner, seeds, 2)
                 assert closed_loop._pool is None
             shared = closed_loop.play(learner, seeds, 2)
