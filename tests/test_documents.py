@@ -12,7 +12,7 @@ import pytest
 
 from vla.io.documents import MAX_DEPTH, STRICT, parse_json, parse_yaml, read_json, read_yaml, resolved
 from vla.io.errors import UserError
-from vla.io.types import Range
+from vla.io.types import NonNegativeRange
 
 
 @dataclass
@@ -48,7 +48,7 @@ def test_a_pipe_a_device_or_a_file_that_is_too_large_is_not_read(tmp_path: Path)
         ('{"size": 1.5, "names": ["x"], "z": 1}', Header, "size: Input should be a valid integer; z: Unexpected"),
         ("[1]", dict[str, Any], "Input should be an object"),
         ('{"a": NaN}', dict[str, float], "a: Input should be a finite number"),
-        ("[2.0, 1.0]", Range, "ascending"),
+        ("[2.0, 1.0]", NonNegativeRange, "ascending"),
         ("[" * 100_000, Any, "recursion limit exceeded"),
         ("[1", Any, "Invalid JSON"),
         (b"\xff", Any, "Invalid JSON"),

@@ -51,10 +51,6 @@ class Schedule(Generic[Action]):
         ends = [start + self._period * (place + 1) for place in range(len(actions))]
         self._plans = [*(plan for plan in self._plans if plan.ends[-1] > start), Plan(start, actions, ends)]
 
-    def clear(self) -> None:
-        """Drop all plans."""
-        self._plans = []
-
     def executed(self, execute: int) -> float:
         """Return the time at which `execute` actions of the newest plan are over; -∞ without one."""
         return self._plans[-1].start + self._period * execute if self._plans else -math.inf

@@ -88,7 +88,7 @@ class GripperOutput:
         self._wanted: bool | None = None  # open?
         self._sent: bool | None = None
 
-    def publish(self, command: Command, now: float) -> None:
+    def publish(self, command: Command) -> None:
         """Pass the opening of a command on, if it has one."""
         if fingers := finger_positions(self._loop.limits, command):
             self._publisher.publish(Float64MultiArray(data=fingers))

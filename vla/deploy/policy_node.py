@@ -207,7 +207,7 @@ class PolicyNode(GuardedLifecycleNode):
         if (command := loop.command(now)) is not None:
             self._arm.publish(command, now)
             if self._gripper:
-                self._gripper.publish(command, now)
+                self._gripper.publish(command)
         self.diagnostics.report_changes()
 
     def _check_publishers(self) -> None:

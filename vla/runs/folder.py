@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -22,8 +21,6 @@ from vla.io.files import write_text
 from vla.rollouts.results import Report
 from vla.runs.files import Change, ErrorsFile, Node, ReportFile, Training
 from vla.spec import IN_DISTRIBUTION, Array
-
-log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 Curve = tuple[Array, Array]  # steps (N,) and values (N,)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,8 +17,6 @@ from vla.jobs.collect import demonstrations
 from vla.runs.folder import CHECKPOINTS
 from vla.training.device import now
 from vla.training.trainer import explain_memory_errors, make_trainer, quiet_lightning
-
-log = logging.getLogger(__name__)
 
 WARM_UP = 3  # steps of a round that are not timed: they allocate and compile
 
