@@ -87,6 +87,10 @@ class RT1(ContextModel, TokenModel):
         self.head = nn.Linear(width, self.tokenizer.bins)
         self.register_buffer("mask", attention_mask(self.history, tokens, self.slots), persistent=False)
 
+    def encode(self, batch: Batch) -> Tensor:
+        """Return (B, T, N, E) tokens of the frames."""
+        return self.context.encode(batch, self.text(batch["text"]))
+
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return logits: (B, T, k, D, K) for every frame; with an auxiliary head, truth: (B, T, S), normalised.
 
