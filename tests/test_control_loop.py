@@ -527,8 +527,12 @@ OTHER: Any = {"action": ("x", "y"), "units": ("m", "m"), "low": (0, 0), "high": 
         ({"safety": replace(SAFETY, workspace=None)}, "needs a box for the tool point"),
         ({"command_hz": 5.0}, "command_hz"),
         ({"limits": replace(ROBOT, **SHORTER)}, "trained with 7 joints, the robot has 6"),
+        (
+            {"limits": replace(ROBOT, joints=[*ARM.joints[1::-1], *ARM.joints[2:]])},
+            rf"the policy has {ARM.joints[0]} where deploy\.robot\.joints has {ARM.joints[1]}: list .* order, {ARM.joints[0]}",
+        ),
     ],
-    ids=["action", "units", "joints", "chain", "box", "rate", "arm"],
+    ids=["action", "units", "joints", "chain", "box", "rate", "arm", "order"],
 )
 def test_a_policy_that_does_not_fit_is_refused(changed: dict[str, Any], words: str) -> None:
     fitting: dict[str, Any] = {"spec": SPEC, "limits": ROBOT, "safety": SAFETY, "command_hz": 50.0}
