@@ -529,7 +529,7 @@ OTHER: Any = {"action": ("x", "y"), "units": ("m", "m"), "low": (0, 0), "high": 
         ({"limits": replace(ROBOT, **SHORTER)}, "trained with 7 joints, the robot has 6"),
         (
             {"limits": replace(ROBOT, joints=[*ARM.joints[1::-1], *ARM.joints[2:]])},
-            rf"the policy has {ARM.joints[0]} where deploy\.robot\.joints has {ARM.joints[1]}: list .* order, {ARM.joints[0]}",
+            rf"has {ARM.joints[0]} where deploy\.robot\.joints has {ARM.joints[1]}: list .* order, {ARM.joints[0]}, ",
         ),
     ],
     ids=["action", "units", "joints", "chain", "box", "rate", "arm", "order"],
