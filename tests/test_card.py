@@ -42,7 +42,7 @@ def test_the_card_tells_what_is_there(tmp_path: Path, figures: list[Figure]) -> 
     low, high = (ends for ends in zip(*(e.draws["point"] for e in EPISODES if e.success), strict=True))
     numbers = [*low, *high]
     assert text.startswith("# store\n") and f"point | {min(numbers):.4g} … {max(numbers):.4g}" in text
-    assert "gripper | 1 | 0 | 1 | 1 | 0" in text and "uint8 16 x 16 x 3 per step" in text
+    assert "gripper | 1 | 1 | 1 | 1 | 0" in text and "uint8 16 x 16 x 3 per step" in text
     assert '"size": 1.0' in text
     found = {axes.get_title(): axes for axes in figures[0].axes}
     assert bars(found["outcomes of all seeds"]) == [4, 1]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from collecting import content
-from command_line import here
+from command_line import SMALL, here
 from toy import ARM_SPEC, make_arm, make_environment, make_expert
 from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, flip
 
@@ -77,6 +77,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], list[int], str]] = {
     "a changed seed": (replaced(b'"seed": 1,', b'"seed": 9,'), [1], "no readable line"),
     "a changed place": (replaced(b'"start": 12,', b'"start": 72,'), [1], "no readable line"),
     "a garbled first line": (of_index(lambda data: b"#" + data), [0], "no readable line"),
+    "a lost first line": (of_index(lambda data: data[data.index(b"\n") + 1 :]), [0], "no readable line"),
     "a garbled last line": (of_index(lambda data: flip(data, len(data) - 2)), [4], "no readable line"),
     "a changed end": (of_index(lambda data: flip(data, len(data) - 1)), [4], "no readable line"),
     "no number": (poison, [0], "not finite"),
@@ -255,6 +256,18 @@ def test_the_job_describes_what_is_damaged_and_repairs_it_beside_it(
     assert (store.folder / "action.bin").read_bytes() == damaged and (tmp_path / "store-repaired/card.md").exists()
     with pytest.raises(ValueError, match="store-repaired exists already"):
         inspect(store.folder, repair=True)
+
+
+def test_a_store_that_was_put_together_is_of_a_task_as_any_other(tmp_path: Path) -> None:
+    collected = (*SMALL, "job=collect", "collect.episodes=2")
+    here(tmp_path, *collected, "collect.folder=all")
+    here(tmp_path, "job=inspect", "inspect.folder=all", "inspect.where={seed: [0, 9]}", "inspect.into=chosen")
+    chosen = (*collected, "collect.folder=chosen")
+    assert "chosen was derived" not in here(tmp_path, *chosen).stdout
+    other = here(tmp_path, *chosen, "task/goal=lift").stdout
+    assert "chosen was derived from demonstrations with another task" in other
+    refused = here(tmp_path, *chosen, "task.image_size=[64,64]", ok=False).stderr
+    assert "the episode store chosen has image_size = " in refused and "the task has" in refused
 
 
 def test_the_job_merges_and_refuses_what_contradicts_itself(tmp_path: Path) -> None:

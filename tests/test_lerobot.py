@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -117,6 +118,11 @@ def test_a_dataset_that_is_there_is_left_alone_and_another_one_is_refused(home: 
     with pytest.raises(ValueError, match=r"dataset has content other .*: choose another export\.folder"):
         exporter("lerobot", home / "dataset").export(EpisodeStore(home / "store", episodes=3))
     assert content(home / "dataset") == before
+    part = Path(shutil.copytree(home / "dataset", tmp_path / "part"))
+    next(part.rglob("*.mp4")).unlink()
+    with pytest.raises(ValueError, match=r"part has content other .*: choose another export\.folder"):
+        exporter("lerobot", part).export(store)
+    shutil.rmtree(part)
     with pytest.raises(ValueError, match=r"export\.crf must be less than or equal to 63, got 64"):
         exporter("lerobot", tmp_path / "none", "export.crf=64")
     with pytest.raises(ValueError, match="no episodes yet"):

@@ -85,8 +85,34 @@ def test_an_import_goes_on_where_it_was(home: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"only 3 recorded episodes: set collect\.episodes=3"):
         imported(home / "dataset", tmp_path / "store", episodes=4)
     other = exporter("lerobot", tmp_path / "other").export(stored(tmp_path / "another", seeds=range(4, 7))[0])
-    with pytest.raises(ValueError, match=r"holds other episodes than these: choose another collect\.folder"):
+    with pytest.raises(
+        ValueError, match=r"holds other episodes than these, such as 0: delete it .* another collect\.folder"
+    ):
         imported(other, tmp_path / "store")
+
+
+def test_an_edited_dataset_is_not_taken_for_what_was_imported(home: Path, tmp_path: Path) -> None:
+    store = Path(shutil.copytree(home / "imported", tmp_path / "store"))
+    edited = Path(shutil.copytree(home / "dataset", tmp_path / "edited"))
+    (edited / "meta/checksums.json").unlink()
+    imported(edited, store)  # it is the same without them
+    tasks = pq.read_table(edited / TASKS)
+    (name,) = [name for name in tasks.column_names if name != "task_index"]
+    words = pa.array([text.upper() for text in tasks[name].to_pylist()])
+    pq.write_table(tasks.set_column(tasks.column_names.index(name), name, words), edited / TASKS)
+    with pytest.raises(ValueError, match="holds other episodes than these, such as 0"):
+        imported(edited, store)
+
+
+def test_what_was_executed_is_that_of_the_components(home: Path) -> None:
+    order = [2, 0]
+    parts = {
+        name: tuple(np.array(getattr(ARM_SPEC, name))[order].tolist()) for name in ("action", "units", "low", "high")
+    }
+    found = demonstrations(home / "dataset", replace(ARM_SPEC, **parts, robot=None)).episode(0)
+    expected = EpisodeStore(home / "store").read(EpisodeStore(home / "store").episodes[0])
+    assert not np.array_equal(found.executed, found.actions)
+    np.testing.assert_array_equal(found.executed, expected["executed"][:, order])
 
 
 def spread(dataset: Path) -> None:

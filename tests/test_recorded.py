@@ -155,6 +155,10 @@ def test_another_recording_is_not_taken_for_the_stored_one(dataset: Path, tmp_pa
     copy = Path(shutil.copytree(dataset, tmp_path / "dataset"))
     bounds = ("task.low=[-99,-99,-99]", "task.high=[99,99,99]", "task.image_size=[12,12]")
     import_it = ("task=recorded", "expert.folder=dataset", *bounds, "job=collect", "collect.folder=store", "output=run")
+    assert (
+        "recorded episodes: set collect.episodes=" in here(tmp_path, *import_it, "collect.episodes=99", ok=False).stderr
+    )
+    assert not (tmp_path / "store").exists()  # which would block what is asked for next
     here(tmp_path, *import_it)
     for path in (copy / "data").rglob("*.parquet"):
         table = pq.read_table(path)

@@ -107,6 +107,11 @@ class EpisodeStore:
         if different:
             raise UserError(f"{self.folder} was collected with another config for {different}: choose another folder")
 
+    def lacks(self, key: str, node: Any) -> bool:
+        """Return whether no part of a derived store has a node of the config."""
+        asked = canonical(json.loads(dumps(node)))
+        return self.derived and all(canonical(config.get(key)) != asked for config, _ in self.config["parts"])
+
     def require_codec(self, codec: Codec | None) -> None:
         """Raise a UserError if the images have other losses than those of `codec`; None: whatever they have."""
         if codec is not None and codec.loss != self.codec.loss:

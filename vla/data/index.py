@@ -171,7 +171,8 @@ def _lines(path: Path) -> list[bytes]:
 def _with_lost(entries: dict[int, Entry], lines: int) -> list[Entry]:
     """Return the readable entries with a `LOST` one for every seed between, before and after them that has none."""
     (first, oldest), *_, (last, newest) = [*entries.items(), *entries.items()]
-    seeds = range(max(oldest.seed - first + 1, 0), newest.seed + lines - last + 1)
+    gone = int(first == 1 and oldest.start > 0)  # lines before the first, of which one at least had these rows
+    seeds = range(max(oldest.seed - first + 1 - gone, 0), newest.seed + lines - last + 1)
     if len(seeds) > 2 * lines:  # a damaged line end joins two lines, so there are at most two seeds to a line
         raise UserError(f"the readable seeds, {oldest.seed} to {newest.seed}, are too far apart: {REMEDY}")
     known = {entry.seed: entry for entry in entries.values()}

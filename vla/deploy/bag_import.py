@@ -232,12 +232,17 @@ class BagDemonstrations(imported.ImportedDemonstrations):
     def episode(self, number: int) -> Episode:
         """Return one episode, with its images; raise a UserError if they are damaged."""
         bag, segment, steps = self._episodes[number]
-        images, rows = self._images(bag, steps), {"state": np.array([step.state for step in steps])}
+        words, state, actions = self.numbers(number)
+        images, rows = self._images(bag, steps), {"state": state}
         for camera in self.spec.cameras:
             rows[f"rgb_{camera}"] = np.array([images[camera, step.arrivals[camera]] for step in steps])
         recorded = {"episode": number, "person": segment.person, "lacks": ["depth"] if self.spec.depth else []}
-        words = segment.instruction
-        return self.recorded_episode(number, words, "unverified", recorded, rows, self._actions[number])
+        return self.recorded_episode(number, words, "unverified", recorded, rows, actions)
+
+    def numbers(self, number: int) -> tuple[str, Array, Array]:
+        """Return what is known of an episode without its images: instruction, state (N, P) and actions (N, D)."""
+        _, segment, steps = self._episodes[number]
+        return segment.instruction, np.array([step.state for step in steps]), self._actions[number]
 
     def _steps(self, bag: _Bag, segment: _Segment) -> list[_Step]:
         """Return the steps of a segment, made as the policy node makes its observations; a UserError without any."""

@@ -36,6 +36,8 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
         folder = experiment["expert"].get("folder")
         if folder and Path(folder).exists() and not store.derived and (recorded := _source(experiment)[2]):
             recorded.require_held(store)
+        if others := [key for key, node in experiment.source.items() if store.lacks(key, node)]:
+            log.warning("%s was derived from demonstrations with another %s", store.folder, " and another ".join(others))
         log.info("%s: %d of its %d episodes, none of them new", store.folder, wanted.episodes, len(store.episodes))
     return EpisodeStore(store.folder, wanted.episodes)
 
@@ -59,6 +61,9 @@ def complete_store(experiment: Experiment) -> EpisodeStore | None:
     store.require(experiment.source)
     store.require_codec(wanted.codec)
     store.require_first_seed(wanted.seed)
+    if store.derived:
+        spec = experiment.world().spec
+        store.spec.without_truth.require(spec.without_truth, f"the episode store {store.folder}", "the task")
     return store if len(store.episodes) >= wanted.episodes else None
 
 
@@ -74,8 +79,10 @@ def _source(experiment: Experiment) -> tuple[Environment | SpecOnly, Spec, Impor
 def _fill(experiment: Experiment) -> EpisodeStore:
     wanted, cluster = experiment.collect, experiment.cluster()
     world, spec, recorded = _source(experiment)
-    if recorded is not None and wanted.seed:
-        raise UserError(f"collect.seed={wanted.seed}: recorded episodes are numbered from 0, so omit it")
+    if recorded is not None:
+        recorded.require_enough(wanted.episodes)
+        if wanted.seed:
+            raise UserError(f"collect.seed={wanted.seed}: recorded episodes are numbered from 0, so omit it")
     store = EpisodeStore.create_or_open(Path(wanted.folder), spec, experiment.source, wanted.codec)
     if recorded is not None:
         added = recorded.fill(store, wanted.episodes)

@@ -60,7 +60,7 @@ def write_card(findings: StoreReport) -> Path:
 
 def _text(findings: StoreReport) -> str:
     store, spec, action = findings.store, findings.store.spec, findings.actions.astype(np.float64)
-    numbers = np.array([spec.low, spec.high, action.mean(0), action.std(0)]).T  # (D, 4)
+    numbers = np.array([action.min(0), action.max(0), action.mean(0), action.std(0)]).T  # (D, 4)
     heads = ("action", "unit", "minimum", "maximum", "mean", "standard deviation")
     rows = zip(spec.action, spec.units, numbers, strict=True)
     draws = spans([entry.draws for entry in findings.whole]).items()

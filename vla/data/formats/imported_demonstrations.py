@@ -58,6 +58,10 @@ class ImportedDemonstrations(ABC):
     def episode(self, number: int) -> Episode:
         """Return one episode; its number is its seed."""
 
+    @abstractmethod
+    def numbers(self, number: int) -> tuple[str, Array, Array]:
+        """Return what is known of an episode without its images: instruction, state (N, P) and actions (N, D)."""
+
     def recorded_episode(
         self,
         number: int,
@@ -87,8 +91,7 @@ class ImportedDemonstrations(ABC):
     def fill(self, store: EpisodeStore, episodes: int) -> int:
         """Append episodes until the store holds `episodes`; returns the number appended (UserError: there are too few,
         the store holds other ones, one is damaged, or the disk is full)."""
-        if episodes > len(self):
-            raise UserError(f"there are only {len(self)} recorded episodes: set collect.episodes={len(self)}, or fewer")
+        self.require_enough(episodes)
         if episodes < len(self):
             log.info("collect.episodes=%d of the %d recorded episodes are used", episodes, len(self))
         self.require_held(store)
@@ -104,11 +107,25 @@ class ImportedDemonstrations(ABC):
                 store.append(self.episode(number))
         return len(missing)
 
+    def require_enough(self, episodes: int) -> None:
+        """Raise a UserError if there are fewer recorded episodes than that."""
+        if episodes > len(self):
+            raise UserError(f"there are only {len(self)} recorded episodes: set collect.episodes={len(self)}, or fewer")
+
     def require_held(self, store: EpisodeStore) -> None:
-        """Raise a UserError unless the last episode that a store and this recording share is the same in both."""
-        held = [entry for entry in store.episodes if entry.seed < len(self)][-1:]
-        if any(not np.array_equal(store.read(entry)["action"], self.episode(entry.seed).actions) for entry in held):
-            raise UserError(f"{store.folder} holds other episodes than these: choose another collect.folder")
+        """Raise a UserError unless the episodes that a store and this recording share are the same but for images."""
+        states, actions, spec = store.rows("state"), store.rows("action"), self.spec
+        for entry in store.episodes:
+            if entry.seed >= len(self):
+                continue
+            words, state, action = self.numbers(entry.seed)
+            action = np.clip(action, spec.low, spec.high).astype(np.float32)
+            same = np.array_equal(states[entry.span], state) and np.array_equal(actions[entry.span], action)
+            if entry.instruction != words or not same:
+                raise UserError(
+                    f"{store.folder} holds other episodes than these, such as {entry.seed}: delete it if it is an "
+                    "import of what they were before, or choose another collect.folder"
+                )
 
 
 def action_bounds(values: Array) -> tuple[float, float]:

@@ -125,7 +125,9 @@ class LeRobotExporter:
 
 def _holds(folder: Path, source: Mapping[str, Any]) -> bool:
     try:
-        return read_json(folder / "meta/vla.json", dict[str, Any], MAX_SOURCE_BYTES) == source
+        files = read_json(folder / layout.CHECKSUMS, layout.Checksums)
+        there = all((folder / name).is_file() for name in files)
+        return there and read_json(folder / "meta/vla.json", dict[str, Any], MAX_SOURCE_BYTES) == source
     except (OSError, ValueError):  # missing or incomplete
         return False
 

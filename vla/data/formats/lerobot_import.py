@@ -76,8 +76,8 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         rates = [key for key in (layout.RATES,) if key in features and features[key].components]
         for name, place in dataset.components(rates).items():
             self._state.setdefault(name, place)
-        same = layout.EXECUTED in features and features[layout.EXECUTED].components == [*spec.action]
-        executed = [layout.EXECUTED] if same else []
+        told = dataset.components([layout.EXECUTED]) if layout.EXECUTED in features else {}
+        executed = [layout.EXECUTED] if all(name in told for name in spec.action) else []
         self._lacks = [*(["depth"] if spec.depth else []), *([] if executed else [layout.EXECUTED])]
         self._lacks += [] if all(name in self._state for name in spec.state) else [layout.RATES]
         differences = [*self._mismatches()]
@@ -86,7 +86,8 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
             self._numbers = dataset.read(list(dict.fromkeys(read)))
             factors = _factors(scale, spec.action)
             self._actions = self._columns(spec.action, self._action, slice(None)) * factors
-            self._numbers |= {key: self._numbers[key] * factors for key in executed}
+            if executed:
+                self._executed = self._columns(spec.action, told, slice(None)) * factors
             differences += imported.out_of_bounds(self._actions, spec, MAX_OUTSIDE)
         if differences:
             raise UserError(f"{dataset.folder} does not match the task: {'; '.join(differences)}")
@@ -128,15 +129,25 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
     def episode(self, number: int) -> Episode:
         """Return one episode, with its images; a UserError if these are damaged."""
         spec, dataset, part = self.spec, self._dataset, self._dataset.parts[number]
-        first = np.arange(part.steps.start, part.steps.stop, self._every)
-        last = np.minimum(first + self._every - 1, part.steps.stop - 1)  # the target at the end of the period
         images = {
             f"rgb_{camera}": dataset.frames(part, camera, spec.image_size, self._every) for camera in spec.cameras
         }
         recorded = {"episode": part.episode, "first_step": part.steps.start, "lacks": self._lacks}
-        executed = None if layout.EXECUTED in self._lacks else self._numbers[layout.EXECUTED][part.rows[last]]
-        rows, actions = {**images, "state": self._states(part.rows)[first]}, self._actions[part.rows[last]]
-        return self.recorded_episode(number, part.instruction, "success", recorded, rows, actions, executed)
+        executed = None if layout.EXECUTED in self._lacks else self._executed[self._steps(number)[1]]
+        words, state, actions = self.numbers(number)
+        rows = {**images, "state": state}
+        return self.recorded_episode(number, words, "success", recorded, rows, actions, executed)
+
+    def numbers(self, number: int) -> tuple[str, Array, Array]:
+        """Return what is known of an episode without its images: instruction, state (N, P) and actions (N, D)."""
+        part, (first, last) = self._dataset.parts[number], self._steps(number)
+        return part.instruction, self._states(part.rows)[first], self._actions[last]
+
+    def _steps(self, number: int) -> tuple[Array, Array]:
+        """Return the first step of every period of an episode, and the row of the last: the target at its end."""
+        part = self._dataset.parts[number]
+        first = np.arange(part.steps.start, part.steps.stop, self._every)
+        return first, part.rows[np.minimum(first + self._every - 1, part.steps.stop - 1)]
 
     def fill(self, store: EpisodeStore, episodes: int) -> int:
         """Append episodes, and log what an import changes: images, episodes of several tasks, actions beyond bounds."""
