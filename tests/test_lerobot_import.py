@@ -105,10 +105,8 @@ def test_an_edited_dataset_is_not_taken_for_what_was_imported(home: Path, tmp_pa
 
 
 def test_what_was_executed_is_that_of_the_components(home: Path) -> None:
-    order = [2, 0]
-    parts = {
-        name: tuple(np.array(getattr(ARM_SPEC, name))[order].tolist()) for name in ("action", "units", "low", "high")
-    }
+    order, names = [2, 0], ("action", "units", "low", "high")
+    parts: dict[str, Any] = {name: tuple(np.array(getattr(ARM_SPEC, name))[order].tolist()) for name in names}
     found = demonstrations(home / "dataset", replace(ARM_SPEC, **parts, robot=None)).episode(0)
     expected = EpisodeStore(home / "store").read(EpisodeStore(home / "store").episodes[0])
     assert not np.array_equal(found.executed, found.actions)
