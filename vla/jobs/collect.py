@@ -37,7 +37,9 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
         if folder and Path(folder).exists() and not store.derived and (recorded := _source(experiment)[2]):
             recorded.require_held(store)
         if others := [key for key, node in experiment.source.items() if store.lacks(key, node)]:
-            log.warning("%s was derived from demonstrations with another %s", store.folder, " and another ".join(others))
+            log.warning(
+                "%s was derived from demonstrations with another %s", store.folder, " and another ".join(others)
+            )
         log.info("%s: %d of its %d episodes, none of them new", store.folder, wanted.episodes, len(store.episodes))
     return EpisodeStore(store.folder, wanted.episodes)
 
