@@ -267,7 +267,9 @@ class Policy:
         if observation.state.shape != (len(spec.state),):
             raise UserError(f"the policy's state is {spec.state}, the observation's {observation.state.shape}")
         if not np.isfinite(observation.state).all():
-            wrong = [name for name, finite in zip(spec.state, np.isfinite(observation.state), strict=True) if not finite]
+            wrong = [
+                name for name, finite in zip(spec.state, np.isfinite(observation.state), strict=True) if not finite
+            ]
             raise UserError(f"the observation's state is not finite in {', '.join(wrong)}")
         rgb = spec.images(observation)
         if missing := [camera for camera in spec.cameras if camera not in rgb]:
