@@ -218,8 +218,14 @@ class Model(nn.Module, ABC):
 def _require_parts(parameters: Collection[str], key: str, parts: Collection[str]) -> None:
     for part in parts:
         if not any(is_within(name, [part]) for name in parameters):
-            known = ", ".join(dict.fromkeys(name.partition(".")[0] for name in parameters))
-            raise UserError(f"learner.{key} names {part}, which no parameter of the model is in: it has {known}")
+            whole = part
+            while whole and not any(is_within(name, [whole]) for name in parameters):
+                whole = whole.rpartition(".")[0]
+            below = [name.removeprefix(f"{whole}.") for name in parameters if not whole or is_within(name, [whole])]
+            known = ", ".join(dict.fromkeys(name.partition(".")[0] for name in below))
+            raise UserError(
+                f"learner.{key} names {part}, which no parameter of the model is in: {whole or 'it'} has {known}"
+            )
 
 
 def _embeddings(model: nn.Module) -> set[int]:
