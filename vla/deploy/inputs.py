@@ -15,7 +15,7 @@ from vla.deploy import messages
 from vla.deploy.control_loop import ControlLoop
 from vla.deploy.diagnostics import Diagnostics
 from vla.deploy.lifecycle_node import GuardedLifecycleNode
-from vla.deploy.observer import OLDEST, age_of
+from vla.deploy.observer import OLDEST
 from vla.deploy.settings import COMPRESSED, PolicySettings
 from vla.io.errors import UserError
 from vla.spec import LONGEST_INSTRUCTION
@@ -68,12 +68,13 @@ class Inputs:
         if stamp == self._stamps.get(source):
             raise UserError("two messages have the same time stamp: is its clock frozen?")
         self._stamps[source] = stamp
-        now = self._node.get_clock().now().nanoseconds * 1e-9
-        if (age := now - (stamp[0] + stamp[1] * 1e-9)) >= OLDEST and source in self._synchronised:
+        age = self._node.get_clock().now().nanoseconds * 1e-9 - (stamp[0] + stamp[1] * 1e-9)
+        if age >= OLDEST and source in self._synchronised:
             raise UserError(f"its time stamp is {age:.0f} s old")
-        if 0 <= age < OLDEST:
-            self._synchronised.add(source)
-        return age_of(stamp, now)
+        if not 0 <= age < OLDEST:
+            return 0.0
+        self._synchronised.add(source)
+        return age
 
     def _on_joint_state(self, message: JointState) -> None:
         now = time.monotonic()

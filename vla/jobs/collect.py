@@ -36,6 +36,9 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
         folder = experiment["expert"].get("folder")
         if folder and Path(folder).exists() and not store.derived and (recorded := _source(experiment)[2]):
             recorded.require_held(store)
+        if store.derived:
+            spec = experiment.world().spec
+            store.spec.without_truth.require(spec.without_truth, f"the episode store {store.folder}", "the task")
         if others := [key for key, node in experiment.source.items() if store.lacks(key, node)]:
             log.warning(
                 "%s was derived from demonstrations with another %s", store.folder, " and another ".join(others)
@@ -63,9 +66,6 @@ def complete_store(experiment: Experiment) -> EpisodeStore | None:
     store.require(experiment.source)
     store.require_codec(wanted.codec)
     store.require_first_seed(wanted.seed)
-    if store.derived:
-        spec = experiment.world().spec
-        store.spec.without_truth.require(spec.without_truth, f"the episode store {store.folder}", "the task")
     return store if len(store.episodes) >= wanted.episodes else None
 
 

@@ -75,7 +75,7 @@ class ImportedDemonstrations(ABC):
         """Make an episode of its rows, by field, without depth, which is 0, and of actions (N, D), to be clipped."""
         spec = self.spec
         depth = {f"depth_{camera}": np.zeros((len(actions), *spec.image_size), np.uint16) for camera in spec.depth}
-        clipped = np.clip(actions, spec.low, spec.high).astype(np.float32)
+        clipped = self._clipped(actions)
         return Episode(
             seed=number,
             task="recorded",
@@ -107,6 +107,9 @@ class ImportedDemonstrations(ABC):
                 store.append(self.episode(number))
         return len(missing)
 
+    def _clipped(self, actions: Array) -> Array:
+        return np.clip(actions, self.spec.low, self.spec.high).astype(np.float32)
+
     def require_enough(self, episodes: int) -> None:
         """Raise a UserError if there are fewer recorded episodes than that."""
         if episodes > len(self):
@@ -114,12 +117,12 @@ class ImportedDemonstrations(ABC):
 
     def require_held(self, store: EpisodeStore) -> None:
         """Raise a UserError unless the episodes that a store and this recording share are the same but for images."""
-        states, actions, spec = store.rows("state"), store.rows("action"), self.spec
+        states, actions = store.rows("state"), store.rows("action")
         for entry in store.episodes:
             if entry.seed >= len(self):
                 continue
             words, state, action = self.numbers(entry.seed)
-            action = np.clip(action, spec.low, spec.high).astype(np.float32)
+            action = self._clipped(action)
             same = np.array_equal(states[entry.span], state) and np.array_equal(actions[entry.span], action)
             if entry.instruction != words or not same:
                 raise UserError(
