@@ -312,13 +312,15 @@ def test_limits_hold_from_one_message_to_the_next(make_world: Callable[..., Worl
     world.policy.action = lambda: generator.uniform(SPEC.low, SPEC.high, (1, 7)).astype(np.float32)
     world.start()
     world.live(1.5)
-    reached: list[np.ndarray] = []
+    reached, before = list[np.ndarray](), positions(world.commands[0])
     fastest, hardest = 0.25 * np.array(ROBOT.speed), 0.05 * np.array(ROBOT.acceleration)
     for ahead in map(positions, world.commands):
         speeds = np.diff([*(reached[-2:] if command != "trajectory" else ()), *ahead], axis=0) / 0.02
         assert (np.abs(speeds) <= fastest + 1e-9).all()
         assert (np.abs(np.diff(speeds, axis=0)) / 0.02 <= hardest + 1e-6).all()
+        assert (np.abs(before - ahead[0]) <= 2 * fastest * 0.02).all(1).any()
         reached.append(ahead[0])
+        before = ahead
     assert len(reached) > 50 and np.ptp(reached, axis=0).max() > 0.05
 
 
