@@ -115,7 +115,10 @@ def test_state_entries_with_one_name_are_told_apart_by_their_paths() -> None:
             {"state": {"observation.state": ["east", "east"]}},
             "task.id=toy/Toy-v0",
         ),
-        ({"options": {"seconds_per_stop": 0.1}}, "task.options={'seconds_per_stop': 0.1} does not fit toy/Toy-v0: "),
+        (
+            {"options": {"seconds_per_stop": 0.1}},
+            "toy/Toy-v0 cannot be made with task.options={'seconds_per_stop'",
+        ),
         ({"images": {"eye": "observation.state"}}, "task.images.eye names no (H, W, 3) image of uint8, but float32"),
     ],
 )

@@ -119,7 +119,7 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     if "trainer" in _given(parsed):
         kept = {name: value for name, value in saved.get("trainer", {}).items() if name not in MACHINES}
         taken["trainer"] = kept | {name: cfg.trainer[name] for name in MACHINES if name in cfg.trainer}
-        parsed = [override for override in parsed if _path(override) != "trainer"]
+        parsed = [override for override in parsed if _path(override) != "trainer" or not _replaces(override)]
     resumed = _on_top(cfg, taken, parsed)
     # Paths of rounds begin with the folder as it was written in the first command.
     same = isinstance(saved.get("output"), str) and Path(saved["output"]).resolve() == run.resolve()
@@ -153,7 +153,8 @@ def require_identity(
 
     The dotted keys of `IDENTITY`, and `further` ones, must have equal values.
     """
-    before, now = ({key: at(each, key, None) for key in (*IDENTITY, *further)} for each in (saved, config))
+    standard = {"trainer.num_nodes": 1}  # which not all trainers name
+    before, now = ({key: at(each, key, standard.get(key)) for key in (*IDENTITY, *further)} for each in (saved, config))
     changed = [key for key, _, _ in differences(before, now)]
     if changed:
         weights = f"; pretrained={folder} starts another from its weights" if (folder / POLICY).exists() else ""
@@ -178,7 +179,12 @@ def _parsed(overrides: Sequence[str], fixed: Sequence[str]) -> list[Override]:
 
 
 def _given(parsed: Iterable[Override]) -> list[str]:
-    return [_path(override) for override in parsed if not override.is_delete()]
+    return [_path(override) for override in parsed if _replaces(override)]
+
+
+def _replaces(override: Override) -> bool:
+    """Return whether an override gives a whole value; Hydra merges mappings with what is there."""
+    return not override.is_delete() and not isinstance(override.value(), dict)
 
 
 def _path(override: Override) -> str:
@@ -204,8 +210,8 @@ def _on_top(cfg: DictConfig, saved: Mapping[str, Any], parsed: Sequence[Override
                 if not isinstance(node, DictConfig):
                     raise UserError(f"{override.input_line} removes a key of {parent}, which the checkpoint lacks")
                 node.pop(name, None)
-            elif isinstance(value := override.value(), dict):  # which Hydra merges with what is there
-                OmegaConf.update(adopted, path, value, merge=True, force_add=True)
-            else:
+            elif _replaces(override):
                 OmegaConf.update(adopted, path, OmegaConf.select(cfg, path), merge=False, force_add=True)
+            else:
+                OmegaConf.update(adopted, path, override.value(), merge=True, force_add=True)
     return adopted

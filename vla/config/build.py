@@ -273,7 +273,7 @@ def _check_nodes(key: str, value: Any) -> None:
 def require_known(key: str, name: str, known: Collection[str], owner: str) -> None:
     """Raise a UserError for a name that `owner` does not take, with the one that was meant, or all that there are."""
     if name not in known:
-        hint = suggestion(name, known) or f": {owner} takes {', '.join(known)}"
+        hint = suggestion(name, known) or f": {owner} takes {', '.join(known) or 'no arguments'}"
         raise UserError(f"{f'{key}.' if key else ''}{name} is unknown{hint}")
 
 

@@ -17,6 +17,8 @@ from vla.io.errors import UserError
 
 OF_EVERY_JOB = ("collect", "validate", "evaluate")
 TRAINING = tuple(group.name for group in GROUPS.values() if group.training)
+# Keys that trainings read, though Lightning has defaults for them.
+NEEDED = {"trainer": ("max_steps", "precision", "accumulate_grad_batches", "val_check_interval")}
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,8 @@ def check(experiment: Experiment, job: Job) -> None:
     for name, group in groups.items():
         if config.get(name) is not None:
             _check_group(config[name], group, may_lack=name in job.stored)
+            if absent := [key for key in NEEDED.get(name, ()) if key not in config[name]]:
+                raise UserError(f"{name}.{absent[0]} is missing: trainings need it")
         elif not group.optional:
             raise UserError(f"job={settings.job} needs {name}=OPTION; --help lists the options")
     if "model" in groups:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from omegaconf import DictConfig, OmegaConf
 
 from vla.config.annotations import locate
-from vla.config.build import Group, build, require_no_paths
+from vla.config.build import GROUPS, Group, build, require_no_paths
 from vla.config.differences import ABSENT, at, differences
 from vla.config.nodes import Collection, Evaluation, Settings, Validation, with_changes
 from vla.config.origin import SECRET, Origin, find_origin
@@ -48,10 +48,11 @@ class Experiment:
     @classmethod
     def of(cls, cfg: DictConfig, default: DictConfig | None = None) -> Experiment:
         """Create the experiment of a composed config; `default` is the config without overrides."""
+        here = {group.name: None for group in GROUPS.values() if group.optional} | plain(cfg)
         if default is None:
-            return cls(plain(cfg))
+            return cls(here)
         chosen, standard = (OmegaConf.to_container(each, resolve=False) for each in (cfg, default))
-        here, there = plain(cfg), plain(default)
+        there = plain(default)
         changes = [
             {"key": key, "here": at(here, key, value), "default": at(there, key, before)}
             for key, value, before in differences(chosen, standard)
@@ -167,7 +168,7 @@ class Experiment:
 
     def make_agent(self) -> Callable[[Environment], Agent] | None:
         """Return the factory of the agent that acts in place of a policy, or None."""
-        if not (node := self.nodes.get("agent")):
+        if not (node := self.nodes["agent"]):
             return None
         # Workers may be in another folder.
         place = {"folder": str(Path(folder).resolve())} if (folder := node.get("folder")) else {}
@@ -182,7 +183,7 @@ class Experiment:
 
     def make_recorder(self, folder: Path) -> Callable[[], Recorder] | None:
         """Return the factory of the recorder that writes into a folder, or None without a recorder."""
-        node = self.nodes.get("recorder")
+        node = self.nodes["recorder"]
         return partial(build, node, "recorder", folder=folder) if node else None
 
     def cluster(self) -> Cluster:
@@ -360,6 +361,6 @@ def _model_node(nodes: Node, saved: SavedPolicy | None, weights: bool) -> Node:
 def _without_weights(model: Node) -> Node:
     """Return a model node without its initial weights, or those of its image encoders, which lie in the policy."""
     nodes = {name: node for name, node in model.items() if isinstance(node, dict)}
-    parts = {name: _without_weights(node) for name, node in nodes.items() if name in ("image", "context")}
+    parts = {name: _without_weights(node) for name, node in nodes.items() if name in ("image", "context", "network")}
     none = {"pretrained": False, "trunk": None}
     return model | parts | {name: value for name, value in none.items() if name in model}

@@ -17,8 +17,8 @@ class DmEnvironment(dm_env.Environment):
     """Adapter of an `Environment` to dm_env.
 
     An observation is that of `vla.envs.gym.GymEnvironment`, with the `instruction` as an array of one string. The
-    reward is 1 for the step that succeeds, otherwise 0. The discount is 0 after success and 1 if an episode ends at its
-    time limit.
+    reward is 1 for the step that succeeds, otherwise 0. The discount is 0 after success and failure, and 1 if an
+    episode ends at its time limit.
     """
 
     def __init__(self, environment: Environment, random_state: int | np.random.RandomState | None = None) -> None:
@@ -39,8 +39,9 @@ class DmEnvironment(dm_env.Environment):
             return self.reset()
         observation = _arrays(self.environment.step(action))
         self._over = self.environment.done
-        if self.environment.outcome == "success":
-            return dm_env.termination(1.0, observation)
+        outcome = self.environment.outcome
+        if outcome == "success" or (self._over and outcome == "failure"):
+            return dm_env.termination(float(outcome == "success"), observation)
         return dm_env.truncation(0.0, observation) if self._over else dm_env.transition(0.0, observation)
 
     def observation_spec(self) -> dict[str, specs.Array]:
@@ -69,4 +70,5 @@ def load(task: str, random_state: int | np.random.RandomState | None = None, **o
 
 
 def _arrays(seen: Observation) -> dict[str, Array]:
-    return {**seen.rgb, "state": seen.state, "instruction": np.array(seen.instruction, dtype=object)}
+    images = {camera: np.ascontiguousarray(image) for camera, image in seen.rgb.items()}  # for torch
+    return {**images, "state": seen.state, "instruction": np.array(seen.instruction, dtype=object)}

@@ -31,8 +31,8 @@ class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
     """Adapter of an `Environment` to gymnasium.
 
     An observation is a dictionary: one image per camera, (H, W, 3) uint8, the `state` (P,) float32 and the
-    `instruction`. The reward is 1 for the step that succeeds, otherwise 0. Success terminates an episode, its time
-    limit truncates it. `info` contains `is_success`, the current outcome and the draws of the episode.
+    `instruction`. The reward is 1 for the step that succeeds, otherwise 0. Success and failure terminate an episode,
+    its time limit truncates it. `info` contains `is_success`, the current outcome and the draws of the episode.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -64,8 +64,9 @@ class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
     def step(self, action: Array) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Apply one (D,) action for one control period."""
         observation = self._arrays(self.environment.step(action))
-        success = self.environment.outcome == "success"
-        return observation, float(success), success, self.environment.done and not success, self._info()
+        outcome, done = self.environment.outcome, self.environment.done
+        ended = outcome == "success" or (done and outcome == "failure")  # which no time limit is
+        return observation, float(outcome == "success"), ended, done and not ended, self._info()
 
     def render(self) -> Array | None:
         """Return the newest images side by side, (H, C·W, 3) uint8."""
@@ -79,7 +80,8 @@ class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
 
     def _arrays(self, observation: Observation) -> dict[str, Any]:
         self._images = list(observation.rgb.values())
-        return {**observation.rgb, "state": observation.state, "instruction": observation.instruction}
+        images = {camera: np.ascontiguousarray(image) for camera, image in observation.rgb.items()}  # for torch
+        return {**images, "state": observation.state, "instruction": observation.instruction}
 
     def _info(self) -> dict[str, Any]:
         outcome = self.environment.outcome

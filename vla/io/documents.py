@@ -6,6 +6,7 @@ import itertools
 import json
 from collections.abc import Iterator
 from functools import cache
+from math import isfinite
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -19,6 +20,7 @@ T = TypeVar("T")
 
 MAX_BYTES = 64 << 20  # [bytes] of a file
 MAX_YAML_BYTES = 1 << 20  # [bytes] of a YAML file, which is slow to parse
+MAX_RESOLVED_BYTES = 4 << 20  # [bytes] of a configuration, which takes thirty times as much before it is counted
 MAX_VALUES = 100_000  # values in a configuration
 MAX_DEPTH = 64  # nesting levels in YAML; pydantic's JSON parser stops at 200 by itself
 
@@ -111,6 +113,8 @@ def resolved(value: Any, name: str) -> Any:
             raise UserError(f"{name} holds the reference {item[:200]!r}: only resolved values are read from files")
         if item is not None and type(item) not in (bool, int, float, str):
             raise UserError(f"{name} holds a {type(item).__name__}, which is no plain data")
+        if type(item) is float and not isfinite(item):  # as 1e999 is
+            raise UserError(f"{name} holds {item}, which is not finite")
         return item
 
     return copied(value, 0)
@@ -125,7 +129,8 @@ def read_resolved(path: Path) -> Any:
         return found
 
     try:
-        value = json.loads(read_bounded(path), object_pairs_hook=unique, parse_constant=int)  # which NaN is not
+        text = read_bounded(path, MAX_RESOLVED_BYTES)
+        value = json.loads(text, object_pairs_hook=unique, parse_constant=int)  # which NaN is not
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is damaged or of another kind: {str(error)[:200]}") from error
     return resolved(value, str(path))

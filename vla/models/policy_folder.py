@@ -19,12 +19,12 @@ from torch.overrides import TorchFunctionMode
 
 from vla.io.documents import STRICT, lines_of, parse_json, parse_plain, read_resolved
 from vla.io.errors import UserError
-from vla.io.types import Natural
+from vla.io.types import Natural, Seed
 from vla.models.hub import HUB, fetch
 from vla.models.model import Model
 from vla.models.trunk import Source, require_trunks, whole_state
 from vla.models.trunk_folder import opened
-from vla.parallel.limits import free_memory, memory
+from vla.parallel.limits import free_memory
 from vla.spec import Spec
 
 POLICY, BEST = "policy", "policy_best"  # in the folder of a run: its policy, and the best one in validation
@@ -48,7 +48,7 @@ class Training:
     steps: Natural  # of the optimiser
     windows: str  # digest of the demonstrations, empty if unknown
     seed: int | None
-    validation: tuple[Natural, Natural] | None  # first seed and number of the episodes that select among weights
+    validation: tuple[Seed, Natural] | None  # first seed and number of the episodes that select among weights
     weights: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]  # SHA-256 of their file
     versions: dict[str, str]  # library → version
     figures: dict[str, float]  # of the last validation
@@ -106,6 +106,8 @@ class SavedPolicy:
             for name, value in (*model.named_parameters(), *model.named_buffers()):
                 if name in state and state[name].dtype != value.dtype:
                     raise UserError(f"{name} has numbers of {state[name].dtype}, not {value.dtype}")
+                if name in state and value.is_floating_point() and not value.isfinite().all():
+                    raise UserError(f"{name} has numbers that are not finite")
         except Exception as error:  # whatever modules raise for a state that is not theirs
             first = lines_of(error)[-1].strip()[:200]
             raise UserError(f"{self.folder} does not fit the model of its own configuration: {first}") from error
@@ -117,7 +119,7 @@ class SavedPolicy:
             UserError: the trunks are larger than the memory.
         """
         elsewhere = sum(source.size for source in {*self.training.trunks.values()})
-        if elsewhere > (free := free_memory() * memory()):
+        if elsewhere > (free := free_memory()):
             raise UserError(
                 f"{self.folder} was trained on weights of {elsewhere / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free"
             )

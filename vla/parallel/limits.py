@@ -34,19 +34,30 @@ def processor() -> str:
     return facts.get("model name") or platform.processor() or platform.machine()
 
 
-def free_memory() -> float:
-    """Return the share of memory that is free, 0…1: of the machine or of the control group with least.
+def free_memory() -> int:
+    """Return the memory [bytes] that is free: in the machine, or in the control group with least.
 
     Containers and batch systems limit memory by control groups.
     """
-    machine = psutil.virtual_memory()
-    return min([machine.available / machine.total, *(share for folder in _groups() for share in _free(folder))])
+    return min(free for _, free in _limits())
+
+
+def scarce_memory(share: float) -> bool:
+    """Return whether less than a share of the memory is free, of the machine or of a control group."""
+    return any(free < share * most for most, free in _limits())
 
 
 def memory() -> int:
     """Return the memory [bytes] of the machine, or of the control group with least."""
-    limits = [limit for folder in _groups() for name, _, _ in MEMORY_FILES if (limit := _number(folder / name))]
-    return min([psutil.virtual_memory().total, *limits])
+    return min(most for most, _ in _limits())
+
+
+def _limits() -> Iterator[tuple[int, int]]:
+    """Yield the whole memory and the free part of it [bytes], of the machine and of each limited control group."""
+    machine = psutil.virtual_memory()
+    yield machine.total, machine.available
+    for group in _groups():
+        yield from _of(group)
 
 
 def _groups() -> Iterator[Path]:
@@ -67,8 +78,8 @@ def _number(file: Path) -> int | None:
         return None
 
 
-def _free(group: Path) -> Iterator[float]:
-    """Yield the free share of a control group's memory if it is limited."""
+def _of(group: Path) -> Iterator[tuple[int, int]]:
+    """Yield the whole memory and the free part of it [bytes] of a control group if it is limited."""
     for limit, used, droppable in MEMORY_FILES:
         most, now = _number(group / limit), _number(group / used)
         try:
@@ -76,4 +87,4 @@ def _free(group: Path) -> Iterator[float]:
         except (OSError, ValueError):
             held = {}
         if most and now is not None:
-            yield max(0.0, 1 - (now - int(held.get(droppable, 0))) / most)
+            yield most, max(0, most - now + int(held.get(droppable, 0)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,7 +81,7 @@ class Report:
     """
 
     results: tuple[Result, ...]
-    tiers: Mapping[str, Sequence[str]] = field(default_factory=dict)  # tier of a benchmark → its tasks
+    tiers: Mapping[str, Sequence[str]] = field(default_factory=dict)  # tier of a benchmark → its tasks, or patterns
     anytime: bool = False  # intervals and p-values are valid whatever the reason to stop playing
 
     @property
@@ -169,7 +170,7 @@ class Report:
     @property
     def by_tier(self) -> dict[str, Report]:
         """Tier → report of its episodes; without tiers of which no episode was completed."""
-        parts = {tier: self._part(tasks, {tier: tasks}) for tier, tasks in self.tiers.items()}
+        parts = {tier: self._part(self._matching(tasks), {tier: tasks}) for tier, tasks in self.tiers.items()}
         return {tier: part for tier, part in parts.items() if part.episodes}
 
     def counted(self, count: int | None = None) -> Counted:
@@ -189,6 +190,10 @@ class Report:
             "tasks": {name: part.counted() for name, part in tasks.items()},
             "tiers": {name: part.counted() for name, part in self.by_tier.items()},
         }
+
+    def _matching(self, patterns: Sequence[str]) -> list[str]:
+        """Return the tasks with names such as `patterns`, in which * stands for any text."""
+        return [task for task in self.tasks if any(fnmatchcase(task, pattern) for pattern in patterns)]
 
     def _part(self, tasks: Sequence[str], tiers: Mapping[str, Sequence[str]] | None = None) -> Report:
         results = tuple(result for result in self.results if result.task in tasks)
@@ -220,7 +225,7 @@ class Report:
     def mean_label(self) -> str:
         """Name of `mean_over_tiers`, which says so if tasks of the tiers are missing from it."""
         listed = {task for tasks in self.tiers.values() for task in tasks}
-        known = sum(part.episodes > 0 for task, part in self.tasks.items() if task in listed)
+        known = sum(any(self.tasks[task].episodes for task in self._matching([name])) for name in listed)
         return "mean over tiers" if known == len(listed) else f"mean over tiers ({known} of {len(listed)} tasks)"
 
     def __str__(self) -> str:

@@ -34,7 +34,7 @@ for number, device in enumerate(egl.eglQueryDevicesEXT()):
 
 
 def choose_backend() -> None:
-    """Set MUJOCO_GL on a machine without a display: EGL, OSMesa if EGL fails, "disabled" if both fail.
+    """Set MUJOCO_GL on Linux: GLFW with a display, else EGL, OSMesa if that fails, too, "disabled" if all fail.
 
     A backend that the user has set is only probed. Triton is blocked or loaded now: after Mesa's renderer its LLVM
     would use parts of Mesa's and crash.
@@ -45,9 +45,9 @@ def choose_backend() -> None:
     choose_device()
     chosen = os.environ.get("MUJOCO_GL")
     known = chosen in (NO_BACKEND, os.environ.get(WORKING_BACKEND, NO_BACKEND))
-    if known or os.environ.get("DISPLAY") or sys.platform != "linux":
+    if known or sys.platform != "linux":
         return
-    candidates = [chosen] if chosen else ["egl", "osmesa"]
+    candidates = [chosen] if chosen else [*(["glfw"] if os.environ.get("DISPLAY") else []), "egl", "osmesa"]
     works = next((name for name in candidates if _output(PROBE, MUJOCO_GL=name) is not None), None)
     os.environ["MUJOCO_GL"] = works or NO_BACKEND
     os.environ[WORKING_BACKEND if works else FAILED_BACKENDS] = works or " or ".join(candidates)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -85,10 +85,13 @@ class Gymnasium(World):
         space = self._environment.action_space
         if not isinstance(space, Box) or len(space.shape) != 1:
             raise UserError(f"{id} has the actions {space}: task=gymnasium takes a Box with one axis")
-        values = self._values(*self._environment.reset(seed=0))
-        alike = len({path.rpartition(".")[2] for path in state}) < len(state)  # then whole paths tell components apart
-        names = [name for path, given in state.items() for name in _named(path, _get(values, path), given, alike)]
-        actions = _named("action", space.low, action)
+        try:
+            values = self._values(*self._environment.reset(seed=0))
+        except Error as error:  # such as a library for drawing that is missing
+            raise UserError(f"task.id={id} cannot be played: {error}") from error
+        labels = zip(state.items(), _labels([*state]), strict=True)
+        names = [name for (path, given), label in labels for name in _named(path, _get(values, path), given, label)]
+        actions = _named("action", space.low, action, "action")
         state_units, action_units = units_of(units, names, actions)
         rate = control_hz or self._environment.metadata.get("render_fps")
         if rate is None:
@@ -173,8 +176,8 @@ def _make(package: str, id: str, options: Mapping[str, object], steps: int | Non
         options = {**options, "render_mode": "rgb_array"}
     try:
         return gymnasium.make(spec, max_episode_steps=steps, disable_env_checker=True, **options)
-    except TypeError as error:
-        raise UserError(f"task.options={dict(options)} does not fit {id}: {error}") from error
+    except (TypeError, ValueError, Error) as error:
+        raise UserError(f"{id} cannot be made with task.options={dict(options)}: {error}") from error
 
 
 def _bound(name: str, given: Numbers | float | None, own: Array) -> tuple[float, ...]:
@@ -203,13 +206,20 @@ def _get(values: Any, path: str, *default: Any) -> Any:
     return found
 
 
-def _named(path: str, values: Any, names: Names | None, whole: bool = False) -> tuple[str, ...]:
-    """Return the names of the components of an array, by default the last part of its path, or all, and numbers; a
-    UserError if there are more or fewer components than names."""
+def _labels(paths: Sequence[str]) -> Sequence[str]:
+    """Return the last parts of dotted paths, or as much of them as tells them apart."""
+    for labels in ([path.rpartition(".")[2] for path in paths], [path.partition(".")[2] for path in paths]):
+        if len({*labels}) == len(labels):
+            return labels
+    return paths
+
+
+def _named(path: str, values: Any, names: Names | None, label: str) -> tuple[str, ...]:
+    """Return the names of the components of an array, by default a label and numbers; a UserError if there are more or
+    fewer components than names."""
     size = np.size(values)
     if names is None:
-        name = path.partition(".")[2] if whole else path.rpartition(".")[2]
-        return tuple(f"{name}_{index}" for index in range(size))
+        return tuple(f"{label}_{index}" for index in range(size))
     if len(names) != size:
         raise UserError(f"{path} has {size} components, and {len(names)} names: {', '.join(names)}")
     return tuple(names)

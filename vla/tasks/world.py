@@ -10,7 +10,7 @@ from zlib import crc32
 import numpy as np
 
 from vla.io.errors import UserError
-from vla.parallel.limits import free_memory
+from vla.parallel.limits import scarce_memory
 
 FREE = 0.25  # share of the memory that scenes leave free
 
@@ -61,7 +61,7 @@ class Scenes(Generic[Scene]):
     def of(self, name: str, make: Callable[[], Scene]) -> Scene:
         """Return the scene called `name`, which `make` makes if there is none."""
         if name not in self._made:
-            if self._made and free_memory() < FREE:
+            if self._made and scarce_memory(FREE):
                 self._made.popitem()[1].close()
             self._made[name] = make()
         return self._made[name]

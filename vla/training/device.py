@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import torch
 
-from vla.parallel.limits import free_memory, memory
+from vla.parallel.limits import free_memory
 
 
 def now(device: torch.device) -> float:
@@ -25,7 +25,7 @@ def memory_of(device: torch.device) -> tuple[float, float]:
     """Return the memory that this process holds, and that it can get [bytes]; see `peak`."""
     if device.type == "cuda":
         return torch.cuda.memory_allocated(device), torch.cuda.mem_get_info(device)[0]
-    return psutil.Process().memory_info().rss - _of_files(), free_memory() * memory()
+    return psutil.Process().memory_info().rss - _of_files(), free_memory()
 
 
 def peak(device: torch.device) -> float:

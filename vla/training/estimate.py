@@ -64,7 +64,7 @@ class Estimate(Callback):
         weights = [local_shard(weight) for weight in pl_module.parameters() if weight.requires_grad]
         averaged = [*weights, *pl_module.buffers()] if any(isinstance(each, EMA) for each in callbacks) else []
         self._held, free = memory_of(device)
-        self._available = (self._held + free) / (trainer.world_size // trainer.num_nodes if on_cpu else 1)
+        self._available = self._held + free / (trainer.world_size // trainer.num_nodes if on_cpu else 1)
         state = 2 * sum(each.nbytes for each in weights) + sum(each.nbytes for each in averaged)
         self._peaks, self._seconds = {0: self._held + sum(each.nbytes for each in weights)}, {0: 0.0}  # with gradients
         self._require(self._peaks[0] + state)

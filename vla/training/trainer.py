@@ -119,6 +119,9 @@ def _trainer(node: Mapping[str, Any], **options: Any) -> Trainer:
     except (MisconfigurationException, RuntimeError, ValueError) as error:
         names = ("accelerator", "devices", "num_nodes", "strategy", "precision")
         chosen = {name: node[name] for name in names if isinstance(node.get(name), str | int)}
+        anywhere = chosen.get("accelerator") in ("auto", "cpu") and "strategy" not in node
+        if anywhere and chosen.get("devices") == 1:  # no machine lacks that
+            raise UserError(f"Lightning refuses the trainer: {error}") from error
         options_text = " ".join(f"trainer.{name}={value}" for name, value in chosen.items())
         raise UserError(f"{options_text} is not available here ({error}): try trainer=cpu or trainer=auto") from error
     return trainer

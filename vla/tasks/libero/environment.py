@@ -75,7 +75,7 @@ class Libero(World):
             randomize: what else differs between drawn starts.
             steps: whose limits of an episode's steps.
             settle: steps before the first observation, in which things come to rest.
-            tiers: suite → tasks, for reports.
+            tiers: suite → tasks, or patterns such as goal*_3, for reports.
 
         Raises:
             UserError: the wheels are missing, or there is no such suite.

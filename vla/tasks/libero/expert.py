@@ -13,6 +13,7 @@ import numpy as np
 from vla.io.errors import UserError
 from vla.spec import Array, Observation, Spec
 from vla.tasks.libero.environment import STATE, action_of
+from vla.tasks.libero.goal import CABINET
 from vla.tasks.libero.grasps import choose_grasp, room_of
 from vla.tasks.libero.package import ALL, tasks_of
 from vla.tasks.libero.places import in_the_way, place_of
@@ -21,6 +22,7 @@ from vla.tasks.libero.skills import approach, carry, command, drag, let_go, pull
 
 DRAWERS = ("wooden_cabinet", "white_cabinet", "yellow_cabinet")  # what must be open for something to be put in
 HOLLOWS = (*DRAWERS, "microwave")  # into which things are brought all the way
+SLIPPED = 0.03  # by which a drawer may close while something is brought into it, before that is let go [m]
 ARRIVED = 0.015  # distance at which they are [m]
 NARROW = 0.006  # room about the hand below which a thing under something else is first dragged out [m]
 
@@ -77,7 +79,7 @@ def decide(at: Situation) -> Array:
             return let_go(at, done[1])
         return command(at, at.hand, at.yaw, -1.0, at.lean)
     part = next((part for part in todo if held is not None and part[1] == held), todo[0])
-    if part[0] in ("on", "in") and _shut(at, part[2]):
+    if part[0] in ("on", "in") and _shut(at, part[2], SLIPPED if part[1] == held else 0.0):
         if part[1] == held:
             return command(at, at.hand, at.yaw, -1.0, at.lean)
         aside = in_the_way(at, part[1], int(at.goal.joints(part[2])[0]))
@@ -108,8 +110,9 @@ def _deliver(at: Situation, thing: str, where: str, held: bool) -> Array:
     return approach(at, grasp, at.points(thing), thing)
 
 
-def _shut(at: Situation, place: str) -> bool:
-    """Return whether a place is in a drawer that must be opened first."""
-    if place in at.goal.bodies or not len(at.goal.joints(place)):
+def _shut(at: Situation, place: str, slack: float) -> bool:
+    """Return whether a place is in a drawer that must be opened first, less open than it must be by `slack` [m]."""
+    if place in at.goal.bodies or not at.subject(place).startswith(DRAWERS):
         return False
-    return at.subject(place).startswith(DRAWERS) and not at.goal.holds(at.data, "open", place)
+    joints = at.goal.joints(place)
+    return bool(len(joints)) and not (at.data.qpos[at.model.jnt_qposadr[joints]] < CABINET[0] + slack).any()

@@ -102,8 +102,13 @@ def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
             costs += _hindrance(hands, at.yaw + turn, rest) + far(at, hands)
         one = int(np.argmin(costs))
         out = form.out(spots[one], rest, OBLIQUE) if roofs[one] else None
-        if held and out is not None:  # the hand must also have room where it comes down
-            one = int(np.argmin(costs + _hindrance(hands + out, at.yaw + turn, rest)))
+        if roofs[one] and out is None and not roofs.all():  # nothing can come in there
+            one = int(np.argmin(np.where(roofs > 0, np.inf, costs)))
+        elif held and out is not None:  # the hand must also have room where it comes down
+            other = int(np.argmin(costs + _hindrance(hands + out, at.yaw + turn, rest)))
+            way = form.out(spots[other], rest, OBLIQUE) if roofs[other] else None
+            if way is not None or not roofs[other]:
+                one, out = other, way
         slack = float(np.clip(gaps[one], TIGHT, LOOSE)) if out is None else SLIT
         options.append((float(gaps[one]), Place(spots[one], turn, slack, out)))
         if gaps[one] > 0:

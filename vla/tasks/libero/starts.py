@@ -29,7 +29,7 @@ class Randomize:
     Args of the config node `task.randomize`.
     """
 
-    places: Share  # of the starts, in which two pairs of things exchange their places
+    places: Share  # of the starts, in which two pairs of things, or one of three, exchange their places
     colours: Share  # of the starts, in which about half of the things have another colour
 
 
@@ -78,7 +78,8 @@ class Starts:
 
         Things on a table are drawn in the ranges of their regions, others, and openings, within what the official
         states span; heights and tilts are those of the official states, which are alike in them. `exchanged`: two pairs
-        of things, on tables, exchange their regions first, unless the sentence or the goal would no longer hold.
+        of things on tables, or one of three, exchange their regions first, unless the sentence or the goal would no
+        longer hold.
         """
         start = self._draw(random, exchanged)
         for _ in range(DRAWS):
@@ -104,7 +105,8 @@ class Starts:
     def _draw(self, random: np.random.Generator, exchanged: bool) -> Start:
         start, model, owners = self.official(0), self._model, dict(self._owners)
         if exchanged and len(self._exchangeable) > 1:
-            for one, other in (random.choice(self._exchangeable, 2, replace=False).tolist() for _ in range(2)):
+            order = random.permutation(self._exchangeable).tolist()
+            for one, other in zip(order[0:4:2], order[1:4:2], strict=False):
                 owners[one], owners[other] = owners[other], owners[one]
         moved = {name: self._move_fixture(name, owners.get(name), start, random) for name in self._task.fixtures}
         start.qpos[:7] = HOME + POSTURE_NOISE * random.standard_normal(7)

@@ -45,7 +45,7 @@ class Renderer(Protocol):
 
         Returns:
             Colours (cameras, height, width, 3) uint8, and depth along the optical axis (cameras, height, width)
-            float32 [m], 0 where nothing is.
+            float32 [m], 0 where nothing is; a sky is something, up to 0.7 to 1 of the farthest distance away.
         """
         ...
 

@@ -8,6 +8,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
+from vla.io.errors import UserError
 from vla.spec import Array, Shape
 from vla.tasks.rendering.shapes import mesh_triangles
 from vla.tasks.tabletop.robot import VISIBLE, TabletopRobot
@@ -165,9 +166,12 @@ class CompiledScene:
         option.disableflags &= ~off
 
     def require_stable(self) -> None:
-        """Raise a FloatingPointError if physics has become unstable in this episode."""
+        """Raise a UserError if physics has become unstable in this episode."""
         if (counts := self.data.warning.number).any():
-            raise FloatingPointError(f"physics is unstable: {mujoco.mjtWarning(int(counts.argmax())).name}")
+            raise UserError(
+                f"physics is unstable ({mujoco.mjtWarning(int(counts.argmax())).name}): task.robot or the range of an "
+                "axis in task.randomize is beyond what it can compute"
+            )
 
     def place_pad(self, pad: int, x: float, y: float) -> None:
         """Put pad `pad` on the table at (x, y) [m]."""

@@ -19,6 +19,7 @@ from vla.spec import Array, RobotModel
 from vla.tasks.tabletop import fingertips, robot_spec
 from vla.tasks.tabletop.robot import PHYSICS, TabletopRobot, attributes
 from vla.tasks.tabletop.robot_file import RobotFile, compiled, require
+from vla.tasks.tabletop.scene import BLOCK_HALF_SIZE
 
 PREFIX = "robot/"  # of the names of all elements in the scene
 FREQUENCY = 100.0  # natural frequency of a joint of the arm with its servo, at home [rad/s]
@@ -29,6 +30,7 @@ FASTEST = 0.02  # time in which its whole force moves a finger through its trave
 CLOSING = 0.2  # shortest time in which the gripper closes [s]
 OPENINGS, SETTLING = 17, 250  # commands at which the opening is measured; steps in which the fingers come to rest
 LEAST_TRAVEL = 0.02  # change of the opening of a gripper that can hold a block [m]
+LEAST_OPENING = 2 * BLOCK_HALF_SIZE + 0.012  # around a block [m]
 ASIDE = 0.08  # largest distance between the tool point and the middle between the closed fingertips [m]
 AROUND_BLOCK = 0.06  # opening with room for a block, in whose middle the tool point belongs [m]
 BESIDE = 0.005  # how far beside this middle it may be [m]
@@ -53,6 +55,8 @@ class FileRobot(TabletopRobot):
         robot_spec.simplify(spec, file.joints, file.open)
         robot_spec.set_armature(spec, file.joints, ARMATURE)
         tool = robot_spec.add_tool(spec, file.tool, home, rotation_z(file.yaw), np.array(file.offset))
+        if np.linalg.norm(np.cross(np.subtract(file.target, file.camera), np.eye(3)[0])) < 1e-6:
+            raise UserError("task.robot.camera and task.robot.target must differ, and not only along the tool's x axis")
         robot_spec.add_camera(*tool, np.array(file.camera), np.array(file.target))
         sides = [fingertips.named(spec, side) for side in file.fingertips]
         strength = zip(home, robot_spec.stiffness(spec, home, FREQUENCY), strict=True)  # as much as its inertia allows
@@ -108,11 +112,11 @@ class FileRobot(TabletopRobot):
                 f"task.robot.offset: the middle between the fingertips is at {np.round(middle, 2).tolist()} m from the "
                 "tool point, forward, to the right and down: the tool point belongs there"
             )
-        if self.widest - self.narrowest <= LEAST_TRAVEL:
+        if self.widest - self.narrowest <= LEAST_TRAVEL or self.widest < LEAST_OPENING:
             raise UserError(
                 f"task.robot.open and task.robot.closed leave the fingertips {1000 * self.widest:.0f} and "
-                f"{1000 * self.narrowest:.0f} mm apart, which holds no block; task.robot.fingertips may name sites at "
-                "the ends of the jaws"
+                f"{1000 * self.narrowest:.0f} mm apart, which holds no block of {2000 * BLOCK_HALF_SIZE:.0f} mm; "
+                "task.robot.fingertips may name sites at the ends of the jaws"
             )
 
     def _close(self, sides: list[list[str]]) -> Array:

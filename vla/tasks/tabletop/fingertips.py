@@ -18,7 +18,7 @@ from vla.io.errors import UserError
 from vla.spec import Array
 from vla.tasks.rendering.shapes import mesh_triangles
 from vla.tasks.tabletop.robot import FINGERTIP_CONTACT, HIDDEN, ROBOT_CONTACT
-from vla.tasks.tabletop.robot_file import require
+from vla.tasks.tabletop.robot_file import compiled, require
 from vla.tasks.tabletop.robot_spec import TOOL, add_hull
 
 FAR_END = 0.03  # length of a jaw's part that holds a block [m]
@@ -34,8 +34,8 @@ def named(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
         if name in geoms or name in bodies:
             tips += [geoms[name]] if name in geoms else bodies[name].geoms
         else:
-            site = sites[name]
-            tips += [_add(site.parent, f"vla_tip_{name}", site.type, pos=site.pos, quat=site.quat, size=site.size)]
+            site, at = sites[name], compiled(spec).site(name)  # with the frames around it, and its angles as quaternion
+            tips += [_add(site.parent, f"vla_tip_{name}", site.type, pos=at.pos, quat=at.quat, size=at.size)]
     solid = [tip.name for tip in tips if tip.contype or tip.conaffinity]
     if not solid:
         raise UserError(

@@ -99,8 +99,9 @@ class Panda(TabletopRobot):
         scene.attach(mjcf.from_xml_string(_mjcf(self._meshes)))
 
     def grip(self, opening: float) -> tuple[float, float]:
-        """Return half the opening, for both fingers and their common servo."""
-        return opening / 2, opening / 2
+        """Return half the opening, at most their travel, for both fingers and their common servo."""
+        half = min(opening / 2, panda.FINGER_TRAVEL)
+        return half, half
 
     def opening(self, model: mujoco.MjModel, data: mujoco.MjData) -> float:
         """Return the sum of both fingers' positions [m]."""

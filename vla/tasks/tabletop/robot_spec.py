@@ -144,6 +144,7 @@ def add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float,
     servo.set_to_position(kp=stiffness, kv=damping)
     servo.ctrllimited = servo.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
     servo.forcelimited, servo.forcerange = force is not None, (-(force or 0.0), force or 0.0)
+    spec.joint(joint).actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # the effort of a URDF
     return SERVO + joint
 
 
@@ -226,11 +227,25 @@ def use_convex_hulls(spec: mujoco.MjSpec) -> None:
             hulls[hull] = add_hull(spec, hull, vertices)
         if hulls[hull] and (geom.contype or geom.conaffinity):
             seen = geom.parent.add_geom(name=f"{geom.name}_seen", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=hull)
-            seen.pos, seen.quat, seen.rgba, seen.group = geom.pos, geom.quat, geom.rgba, VISIBLE
+            seen.pos, seen.quat = _frame_of(model, geom)
+            seen.rgba, seen.group = geom.rgba, VISIBLE
             seen.material, seen.mass, seen.contype, seen.conaffinity = "", 0.0, 0, 0
             geom.group = HIDDEN
         elif hulls[hull]:
             geom.meshname = hull
+
+
+def _frame_of(model: mujoco.MjModel, geom: Any) -> tuple[Array, Array]:
+    """Return position [m] and quaternion of a mesh's own frame in the body of a compiled geom.
+
+    An element of a spec has these as they were written: without the frames around it, and by angles or axes.
+    """
+    placed, mesh = model.geom(geom.name), model.mesh(geom.meshname)
+    back, turn, off = np.empty(4), np.empty(4), np.empty(3)
+    mujoco.mju_negQuat(back, model.mesh_quat[mesh.id])  # the compiled geom is in the mesh's frame of inertia
+    mujoco.mju_mulQuat(turn, placed.quat, back)
+    mujoco.mju_rotVecQuat(off, model.mesh_pos[mesh.id], turn)
+    return placed.pos - off, turn
 
 
 def add_hull(spec: mujoco.MjSpec, name: str, points: Array) -> bool:

@@ -18,6 +18,8 @@ from vla.tasks.tabletop.scene import COLOURS
 
 AT_REST = 0.02  # speed below which a block is at rest [m/s]
 
+SLOTS = frozenset({"block", "other", "pad", "rest", "absent"})  # of instructions, which goals fill
+
 Skill = Literal["place", "hold", "push", "stay"]
 SKILLS: tuple[Skill, ...] = ("place", "hold", "push", "stay")
 
@@ -128,6 +130,8 @@ class Goal(ABC):
         known = ["block", "other"][: self.named] + ["pad", "rest"][: self.pads] + ["absent"] * bool(self.absent)
         if unknown := sorted(language.slots - set(known)):
             raise UserError(f"task.goal.language has the slots {unknown}, but {type(self).__name__} fills {known}")
+        if taken := sorted(SLOTS & {*language.words, *language.held_out_words}):
+            raise UserError(f"task.goal.language.words has {taken}, which {type(self).__name__} itself fills")
         if strange := sorted(set(language.held_out_colours) - set(COLOURS)):
             raise UserError(f"task.goal.language.held_out_colours has {strange}, the colours are {', '.join(COLOURS)}")
         self.language, self.hold_steps = language, hold_steps

@@ -21,15 +21,15 @@ PATTERNS = ("checks", "stripes", "patches")
 class Light:
     """Brightness, colour and direction of the lamp."""
 
-    brightness: NonNegativeRange | None  # range of brightness 0…1, or None for the nominal one
+    brightness: NonNegativeRange | None  # range of brightness, 1: white; or None for the nominal one
     tint: Share  # maximum change of each channel
-    tilt: Angle  # maximum tilt [rad]
+    tilt: Angle  # maximum tilt about both horizontal axes, if the lamp hung straight above [rad]
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw the properties of the directional lamp."""
         nominal = scene.model.light_diffuse[0]
         brightness = nominal if self.brightness is None else random_state.uniform(*self.brightness)
-        diffuse = brightness + random_state.uniform(-self.tint, self.tint, 3)
+        diffuse = np.maximum(0.0, brightness + random_state.uniform(-self.tint, self.tint, 3))
         direction = scene.model.light_dir[0] + np.append(np.tan(random_state.uniform(-self.tilt, self.tilt, 2)), 0.0)
         scene.model.light_diffuse[0] = diffuse
         scene.model.light_dir[0] = direction / np.linalg.norm(direction)
