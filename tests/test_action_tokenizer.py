@@ -21,8 +21,7 @@ from vla.models.layers import mean_where
 from vla.models.policy_folder import read_policy
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile
-from vla.models.tokenizers.tokenization_error import out_of_bounds, rounding
-from vla.models.tokenizers.tokenizer import ActionTokenizer, PerComponent, RT1Bins, Uniform
+from vla.models.tokenizers.tokenizer import ActionTokenizer, PerComponent, RT1Bins, Uniform, out_of_bounds, rounding
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from vla.config.adopt import adopt
 from vla.config.build import build
 from vla.config.experiment import Experiment, plain
 from vla.config.resolvers import digest
-from vla.io.suggestion import suggestion
+from vla.io.errors import suggestion
 from vla.models.policy_folder import require_unseen
 from vla.run import sentence
 
@@ -284,12 +284,36 @@ def test_a_checkpoint_brings_its_task_tokenizer_and_model_and_task_overrides_app
     assert harder.task.blocks == 4
     assert untouched.chosen == {**SAVED["chosen"], "randomize": "default"}
     assert "light" not in adopt(cfg, ["~task.randomize.light"]).task.randomize
+    with pytest.raises(ValueError, match=r"names a path or an address in task\.robot\.file: .*; task/robot=OPTION"):
+        adopt(config(job="export", checkpoint=str(_with_a_file(checkpoint))), ["task.robot={yaw: 0.1}"])
     merged = adopt(cfg, ["task.randomize={size: {b: 2}}"])
     assert OmegaConf.to_container(merged.task.randomize) == {**SAVED["task"]["randomize"], "size": {"b": 2}}
     with pytest.raises(ValueError, match=r"removes a key of task\.nothing, which the checkpoint lacks"):
         adopt(cfg, ["~task.nothing.light"])
     elsewhere = adopt(cfg, ["+task/randomize@evaluate.conditions.wide.randomize=wide"])
     assert OmegaConf.to_container(elsewhere.task) == SAVED["task"]
+
+
+def _with_a_file(checkpoint: Path) -> Path:
+    """A policy whose task names a file."""
+    task = {**SAVED["task"], "robot": {"_target_": "vla.tasks.tabletop.robot_file.RobotFile", "file": "/theirs"}}
+    return save_policy(checkpoint.parent / "with_a_file", {**SAVED, "task": task})
+
+
+def test_what_is_removed_from_the_command_line_is_told_before_any_work() -> None:
+    cfg = composed("job=train")
+    OmegaConf.set_struct(cfg, False)
+    del cfg.logger, cfg.recorder
+    check(cfg)
+    assert Experiment.of(cfg)["logger"] is None and Experiment.of(cfg).make_recorder(Path()) is None
+    del cfg.trainer.max_steps
+    with pytest.raises(ValueError, match=r"trainer\.max_steps is missing: trainings need it"):
+        check(cfg)
+
+
+@pytest.mark.parametrize("renderer", ["mujoco", "detailed", "fast"])
+def test_an_experiment_goes_with_every_renderer(renderer: str) -> None:
+    check(composed("job=collect", "experiment=libero", f"task/renderer={renderer}"))
 
 
 KEPT = [

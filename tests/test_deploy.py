@@ -301,6 +301,12 @@ def test_a_policy_is_deployed_where_nothing_renders(monkeypatch: pytest.MonkeyPa
     assert os.environ["MUJOCO_GL"] == "disabled"
     with pytest.raises(UserError, match="this machine cannot render with MUJOCO_GL=egl or osmesa"):
         backend.require_backend()
+    for name in ("MUJOCO_GL", backend.FAILED_BACKENDS):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("DISPLAY", ":99")  # which nobody serves
+    backend.choose_backend()
+    with pytest.raises(UserError, match="MUJOCO_GL=glfw or egl or osmesa"):
+        backend.require_backend()
 
 
 def test_a_middleware_that_ignores_the_profile_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

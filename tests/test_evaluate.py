@@ -18,7 +18,7 @@ from vla.jobs.evaluate import require_possible
 from vla.parallel.pool import Cluster
 from vla.reports.evaluation import summary, write_report
 from vla.rollouts.evaluate import evaluate
-from vla.rollouts.recordings import chosen, keep_recordings
+from vla.rollouts.recordings import chosen, merge_recordings
 from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.runs.folder import read_report
@@ -90,6 +90,15 @@ def test_tiers_weigh_the_same_whatever_the_number_of_their_tasks() -> None:
     assert told["mean_over_tiers"]["mean"] == pytest.approx(0.55)
     assert {tier: part["rate"] for tier, part in told["tiers"].items()} == {"easy": 0.9, "very_hard": 0.2}
     assert "mean over tiers" not in str(Report(tuple(results[:20]), tiers))
+
+
+def test_a_tier_may_name_its_tasks_by_patterns() -> None:
+    tiers = {"goal": ["goal*_0", "goal*_1"], "long": ["long*_0"]}
+    played = [Result(n, "success", task=task) for n, task in enumerate(("goal_0", "goal_swap_1", "long_swap_0"))]
+    report = Report(tuple(played), tiers)
+    assert {tier: part.episodes for tier, part in report.by_tier.items()} == {"goal": 2, "long": 1}
+    assert report.mean_label == "mean over tiers"
+    assert Report(tuple(played[1:]), tiers).mean_label == "mean over tiers (2 of 3 tasks)"
 
 
 def test_a_condition_of_a_benchmark_keeps_its_interval_on_the_page(tmp_path: Path) -> None:
@@ -220,7 +229,7 @@ def test_libraries_use_one_thread_while_it_lasts(monkeypatch: pytest.MonkeyPatch
 def test_recordings_are_kept_in_one_file_failures_first(tmp_path: Path) -> None:
     folder, target = tmp_path / "recordings", tmp_path / "rollouts.rrd"
     report = evaluate(toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS[:5])
-    assert keep_recordings(report, folder, target, 3) == [SEEDS[3], SEEDS[0], SEEDS[1]]
+    assert merge_recordings(report, folder, target, 3) == [SEEDS[3], SEEDS[0], SEEDS[1]]
     kept = [entry.recording_id.rpartition("-")[0] for entry in RrdReader(target).recordings()]
     assert kept == ["failure-01000003-timeout", "success-01000000", "success-01000001"]
     assert list(tmp_path.iterdir()) == [target]
@@ -282,4 +291,4 @@ def test_what_ends_differently_when_played_again_has_no_recording(
 
     report = evaluate(Fickle, toy.make_agent, toy.make_recorder(tmp_path), SEEDS[:2], recordings=2)
     assert report.successes == 2 and "seed 1000000 has no recording" in caplog.text
-    assert keep_recordings(report, tmp_path, tmp_path / "rollouts.rrd", 2) == []
+    assert merge_recordings(report, tmp_path, tmp_path / "rollouts.rrd", 2) == []

@@ -92,6 +92,8 @@ def test_bounds_and_units_are_those_of_the_user_where_told() -> None:
 def test_state_entries_with_one_name_are_told_apart_by_their_paths() -> None:
     world = make(state={"observation.state": None, "info.truth.state": None}, id="toy/Twice-v0")
     assert world.spec.state == ("state_0", "state_1", "truth.state_0", "truth.state_1")
+    world = make(state={"observation.state": None, "info.state": None}, id="toy/Twice-v0")
+    assert world.spec.state == tuple(f"{path}.state_{n}" for path in ("observation", "info") for n in (0, 1))
 
 
 @pytest.mark.parametrize(

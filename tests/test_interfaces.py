@@ -27,6 +27,25 @@ WORLDS = Path(__file__).parents[1] / "docs/worlds.md"
 TASK = "vla.envs:vla/Tabletop-v0"
 
 
+class Falling(ToyEnvironment):
+    """The toy world, in which the second step is a failure that ends the episode."""
+
+    def step(self, action: Any) -> Observation:
+        observation = super().step(action)
+        self.outcome, self.done = "failure", True
+        return observation
+
+
+def test_a_failure_is_no_time_limit() -> None:
+    environment = GymEnvironment(Falling())
+    environment.reset(seed=3)
+    assert environment.step(np.zeros(3, np.float32))[1:4] == (0.0, True, False)
+    adapted = DmEnvironment(Falling())
+    adapted.reset(3)
+    last = adapted.step(np.zeros(3, np.float32))
+    assert last.last() and (last.reward, last.discount) == (0.0, 0.0)
+
+
 @pytest.fixture(scope="module")
 def lift() -> Iterator[Any]:
     """A small task, made by gymnasium."""

@@ -13,8 +13,9 @@ from conftest import CONF, make_tabletop
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
+from vla.config.build import build
 from vla.config.compose import axes
-from vla.config.experiment import Experiment
+from vla.config.experiment import Experiment, plain
 from vla.io.documents import read_yaml
 from vla.spec import FIRST_SEED
 from vla.tasks.tabletop.language import Grammar, HeldOut, Silence
@@ -61,6 +62,11 @@ def test_other_words_replace_all_that_is_named_or_nothing_is_said() -> None:
     for instruction in ("put the red cup on the pad, the red one", "lift the redder block"):
         with pytest.raises(ValueError, match=r"task\.randomize\.phrasing\.words has no other words .* in '(put|lift) "):
             paraphrase(instruction, {"the pad": "the disc"}, ["red"])
+
+
+def test_a_word_that_the_goal_fills_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"task\.goal\.language\.words has \['pad'\], which Place itself fills"):
+        build(plain(composed("task/goal=place", "+task.goal.language.words.pad=[pad,disc]").task), "task")
 
 
 def heard() -> set[str]:

@@ -26,15 +26,15 @@ from vla.data.episodes import EpisodeStore
 from vla.data.formats.lerobot_import import LeRobotDemonstrations
 from vla.data.verification import require_whole, verify_store
 from vla.policy import Policy
+from vla.reports.comparison_page import tabulate
 from vla.reports.dataset_card import store_table, write_card
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.observations import reset_panels
 from vla.reports.pictures import save
 from vla.reports.run_page import write_page
-from vla.reports.sweep import tabulate
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.recorder import RerunRecorder
-from vla.rollouts.recordings import keep_recordings
+from vla.rollouts.recordings import merge_recordings
 from vla.runs.folder import save_config
 from vla.spec import FIRST_SEED
 
@@ -94,7 +94,7 @@ def test_a_policy_is_evaluated_recorded_and_reported(folder: Path, tmp_path: Pat
     assert report.episodes == 3 and {*report.tasks} == {
         toy.make_environment().reset(seed).instruction.split()[3] for seed in seeds
     }
-    recorded = keep_recordings(report, cell / "recordings", cell / "rollouts.rrd", "all")
+    recorded = merge_recordings(report, cell / "recordings", cell / "rollouts.rrd", "all")
     assert sorted(recorded) == [*seeds]
     entities = {chunk.entity_path for chunk in RrdReader(cell / "rollouts.rrd").stream()}
     assert {"/camera/eye/rgb", "/state/m", "/action/1/executed"} <= entities

@@ -24,14 +24,14 @@ from vla.config.differences import differences
 from vla.config.origin import Origin
 from vla.io.files import warn_on_error
 from vla.reports.comparison import compare, read_runs, rows_of
+from vla.reports.comparison_page import tabulate
 from vla.reports.evaluation import write_report
 from vla.reports.observations import draw_samples
 from vla.reports.run_page import write_page
-from vla.reports.sweep import tabulate
 from vla.reports.training_curves import training_sections
 from vla.rollouts.moving_picture import save_moving_picture
 from vla.rollouts.recorder import RerunRecorder
-from vla.rollouts.recordings import keep_recordings, shown
+from vla.rollouts.recordings import merge_recordings, shown
 from vla.rollouts.results import Report, Result
 from vla.rollouts.rollout import rollout
 from vla.rollouts.statistics import pooled_interval
@@ -61,7 +61,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     environment, recorder = make_environment(), RerunRecorder(folder / "recordings", pictures=6)
     episodes = [rollout(environment, ThinkingAgent(), seed, recorder) for seed in SEEN]
     report = Report(tuple(Result(each.seed, each.outcome, each.instruction) for each in episodes))
-    keep_recordings(report, folder / "recordings", folder / "rollouts.rrd", "all")
+    merge_recordings(report, folder / "recordings", folder / "rollouts.rrd", "all")
     first = [episode.observations[0] for episode in episodes]
     batch: dict[str, Any] = {
         "rgb": {name: np.stack([seen.rgb[name] for seen in first])[:, None] for name in first[0].rgb},

@@ -208,6 +208,12 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
         ),
         r"model\.safetensors is damaged, or not the file",
     ),
+    "weights that are no numbers": (
+        weights(lambda state: {name: value * float("nan") for name, value in state.items()}),
+        "has numbers that are not finite",
+    ),
+    "a number beyond all others": (text("config.json", '{"task": {"a": 1e999}}'), "holds inf, which is not finite"),
+    "a large configuration": (text("config.json", "[" + "0," * (2 << 20) + "0]"), r"bytes, more than the \d+ that"),
     "truncated": (
         lambda folder: os.truncate(folder / "model.safetensors", 1000) or _sign(folder),
         r"model\.safetensors is damaged: ",

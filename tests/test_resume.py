@@ -13,7 +13,7 @@ import torch
 from composing import composed
 from saved_policies import save_policy
 
-from vla.config.adopt import resume
+from vla.config.adopt import require_identity, resume
 from vla.config.experiment import plain
 from vla.reports.evaluation import write_report
 from vla.rollouts.results import Report, Result
@@ -60,12 +60,23 @@ def test_a_run_is_resumed_with_its_config_in_its_folder(tmp_path: Path) -> None:
     assert (resumed.model.width, resumed.collect.episodes, resumed.evaluate.episodes) == (17, 3, 7)
     assert (resumed.trainer.accelerator, resumed.trainer.gradient_clip_val) == ("cpu", 2)
     assert (resumed.trainer.max_steps, resumed.trainer.precision) == (9, "bf16")  # of the run, not of trainer=cpu
+    longer = resume(now, tmp_path / "one", ["trainer={max_steps: 12}"])  # which merges, as in Hydra
+    assert (longer.trainer.max_steps, longer.trainer.precision) == (12, "bf16")
     with pytest.raises(ValueError, match="omit checkpoint="):
         resume(composed(f"output={tmp_path}/now", "checkpoint=x"), tmp_path / "one", [])
     with pytest.raises(ValueError, match="nothing was trained in that folder"):
         resume(now, tmp_path / "other", [])
     with pytest.raises(ValueError, match="experiment=few cannot be combined"):
         resume(now, tmp_path / "one", ["experiment=few"])
+
+
+def test_one_machine_is_one_whether_a_trainer_says_so_or_not(tmp_path: Path) -> None:
+    two = ("job=train", "trainer=ddp", "trainer.devices=2")
+    leave(tmp_path / "one", plain(composed(*two)), finished=False)
+    said = ["trainer=auto", "trainer.devices=2"]
+    now = resume(composed(f"output={tmp_path}/now", *said), tmp_path / "one", said)
+    assert "num_nodes" not in now.trainer
+    require_identity(plain(composed(*two)), plain(now), tmp_path / "one")
 
 
 @pytest.mark.parametrize(("finished", "chosen"), [(False, False), (False, True), (True, False), (True, True)])

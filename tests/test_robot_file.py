@@ -38,6 +38,7 @@ from vla.deploy.control_loop import ControlLoop
 from vla.deploy.joint_limiter import JointLimits
 from vla.robots.chain import forward_of
 from vla.spec import Spec
+from vla.tasks.rendering.shapes import mesh_triangles
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.file_robot import FileRobot
 from vla.tasks.tabletop.robot_file import InstalledRobot, RobotFile
@@ -112,6 +113,37 @@ def test_sites_become_fingertips_of_their_own_shape(tmp_path: Path) -> None:
     opened = np.array([0.012 - 0.011 * np.cos(angle) + 0.075 * np.sin(angle), 0.02])
     opened[1] += 0.075 * np.cos(angle) + 0.011 * np.sin(angle)
     assert robot.widest == pytest.approx(np.linalg.norm(opened - [-0.001, 0.095]) - 0.01, abs=1e-3)
+
+
+def test_frames_and_angles_of_a_file_are_those_of_what_is_seen_and_of_what_holds(tmp_path: Path) -> None:
+    """An element of MuJoCo's specification has neither the frames around it nor its angles as a quaternion."""
+    plain_hand = hinged(*(f'<site name="{name}" type="box" size="0.01 0.004 0.01"/>' for name in ("tip", "jaw_tip")))
+    turned = plain_hand.replace('mesh="housing"/>', 'mesh="housing" euler="0 0 90"/>')
+    turned = turned.replace('<site name="tip" ', '<frame pos="0 -0.005 0.09"><site name="tip" euler="0 0 90" ')
+    turned = turned.replace('0.01"/></body>', '0.01"/></frame></body>', 1)
+    turned = turned.replace('<site name="jaw_tip" ', '<site name="jaw_tip" pos="0 -0.011 0.075" ')
+    (tmp_path / "arm.xml").write_text(mjcf(turned, actuators="", more=MESHES))
+    sites = {**HINGED, "fingertips": [["tip"], ["jaw_tip"]], "offset": [0.0, 0.02, 0.1]}
+    robot = FileRobot(RobotFile(**arguments_of(tmp_path / "arm.xml", **sites)), "light")
+    model = CompiledScene(robot, blocks=0).model
+    tip = model.geom("robot/vla_tip_tip")
+    np.testing.assert_allclose(tip.pos, [0, -0.005, 0.09], atol=1e-6)
+    np.testing.assert_allclose(np.abs(tip.quat), [0.5**0.5, 0, 0, 0.5**0.5], atol=1e-6)
+    geoms = [model.geom(index) for index in range(model.ngeom)]
+    solid = next(
+        geom for geom in geoms if model.body(geom.bodyid[0]).name == "robot/fixed_jaw" and "seen" not in geom.name
+    )
+    seen = model.geom(f"{solid.name}_seen")
+    corners = [_corners(model, each) for each in (solid, seen)]
+    np.testing.assert_allclose(corners[0].min(axis=0), corners[1].min(axis=0), atol=1e-5)
+    np.testing.assert_allclose(corners[0].max(axis=0), corners[1].max(axis=0), atol=1e-5)
+
+
+def _corners(model: mujoco.MjModel, geom: Any) -> np.ndarray:
+    """The corners (N, 3) of a geom that is a mesh, in the frame of its body [m]."""
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, geom.quat)
+    return geom.pos + mesh_triangles(model, int(geom.dataid[0]))[0].astype(float) @ turn.reshape(3, 3).T
 
 
 SECOND = """<body name="other" pos="0 0.5 0"><geom size="0.02"/>
@@ -234,6 +266,14 @@ WRONG: tuple[tuple[dict[str, Any], str], ...] = (
     ({"home": [0.0] * 6}, r"task\.robot\.offset: the middle between the fingertips is at \[0\.0, 0\.0, -0\.16\]"),
     ({"home": [0.0, 0.37, 1.82, 0.0, 0.3, 0.0]}, r"task\.robot\.home leaves the axes of hand askew"),
     ({"open": dict.fromkeys(FINGERS, 0.001)}, r"leave the fingertips \d+ and \d+ mm apart, which holds no block"),
+    (
+        {"camera": [0.1, 0.0, 0.0], "target": [0.0, 0.0, 0.0]},
+        r"task\.robot\.camera and task\.robot\.target must differ",
+    ),
+    (
+        {"open": dict.fromkeys(FINGERS, 0.025)},
+        r"leave the fingertips 5\d and \d+ mm apart, which holds no block of 40 mm",
+    ),
     ({"mount": "b3", "hand": Path("none.xml")}, r"task\.robot\.hand=none\.xml: there is no such file"),
 )
 

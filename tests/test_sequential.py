@@ -14,7 +14,7 @@ from scipy.special import betaln
 from vla.parallel.pool import Cluster
 from vla.rollouts.comparison import Pairs, compare_pairs
 from vla.rollouts.evaluate import evaluate
-from vla.rollouts.recordings import keep_recordings
+from vla.rollouts.recordings import merge_recordings
 from vla.rollouts.results import Report, Result
 from vla.rollouts.sequential import (
     anytime_difference,
@@ -122,7 +122,7 @@ def test_recordings_of_episodes_that_do_not_count_are_removed(tmp_path: Path) ->
     report = evaluate(
         toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS, Cluster(2, "beside"), until=until
     )
-    recorded = keep_recordings(report, folder, tmp_path / "rollouts.rrd", "all")
+    recorded = merge_recordings(report, folder, tmp_path / "rollouts.rrd", "all")
     assert sorted(recorded) == [each.seed for each in report.results]
     assert [path.name for path in tmp_path.iterdir()] == ["rollouts.rrd"]
 

@@ -31,7 +31,8 @@ class Twice(Toy):
 
     def _info(self) -> dict[str, Any]:
         info = super()._info()
-        return {**info, "truth": {**info["truth"], "state": info["truth"]["point"]}}
+        own = info["truth"]["point"]
+        return {**info, "state": own, "truth": {**info["truth"], "state": own}}
 
 
 class Unbounded(Toy):

@@ -29,9 +29,8 @@ from vla.config.compose import compose as compose_again
 from vla.config.experiment import Experiment
 from vla.config.packages import offer_options, trust
 from vla.deploy import ros
-from vla.io.errors import UserError
+from vla.io.errors import UserError, suggestion
 from vla.io.printable import printable
-from vla.io.suggestion import suggestion
 from vla.parallel.processes import ease_garbage_collection, spin_briefly, without_triton
 
 SWEEP = "in the sweep "  # prefix of a note on a cell's error
@@ -112,7 +111,7 @@ def _require_sweepable(experiment: Experiment, groups: Container[str]) -> None:
     if "${" not in given.get("output", "${"):
         raise UserError("with -m every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR")
     slurm = config.runtime.choices["hydra/launcher"] == "submitit_slurm"
-    if "trainer" in groups and not slurm and devices(experiment.trainer) > 1:
+    if "trainer" in groups and not slurm and devices(experiment["trainer"]) > 1:
         # Processes that a trainer starts repeat the command line, here the whole sweep.
         raise UserError(
             "-m cannot train on several devices in this launcher: add trainer.devices=1, "
@@ -151,7 +150,7 @@ def _do(cfg: DictConfig) -> float | None:
     experiment, job = Experiment.of(cfg, default), jobs.find(cfg.job)
     check(experiment, job)
     _require_sweepable(experiment, job.needs(experiment.nodes))
-    if jobs.builds_world(experiment) and (others := substitutes(experiment.task, overrides)):
+    if jobs.builds_world(experiment) and (others := substitutes(experiment["task"], overrides)):
         overrides += others
         experiment = Experiment.of(_adopted(compose_again(*overrides), overrides), default)
     return jobs.run(experiment)

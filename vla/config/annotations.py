@@ -24,8 +24,7 @@ from pydantic_core import PydanticCustomError
 
 from vla.config.packages import can_be_trusted, is_trusted
 from vla.io.documents import mappings
-from vla.io.errors import UserError
-from vla.io.suggestion import suggestion
+from vla.io.errors import UserError, suggestion
 
 # Configs also come from policies and stores of other people. A `_target_` may name a class of this package, one of
 # those that `conf/` uses, or one that the user trusts.

@@ -35,8 +35,7 @@ from vla.config.annotations import (
 )
 from vla.config.packages import MISSING
 from vla.io.documents import resolved
-from vla.io.errors import UserError
-from vla.io.suggestion import suggestion
+from vla.io.errors import UserError, suggestion
 from vla.io.types import Count, Inherited, Natural, NonNegative, Share
 
 HYDRA_KEYS = ("_target_", "_partial_")

@@ -98,7 +98,7 @@ def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None
         changed["improve.changes"] = experiment.options(Rounds).changes
     for name, changes in changed.items():
         if changes:
-            check_node(f"task ({name})", with_changes(experiment.task, changes), makes(GROUPS["task"]))
+            check_node(f"task ({name})", with_changes(experiment["task"], changes), makes(GROUPS["task"]))
 
 
 def devices(trainer: Mapping[str, Any]) -> int:

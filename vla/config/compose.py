@@ -22,8 +22,7 @@ from vla.config.build import check_value
 from vla.config.experiment import Node, plain
 from vla.config.packages import CONF, offer_options
 from vla.io.documents import read_yaml
-from vla.io.errors import UserError
-from vla.io.suggestion import suggestion
+from vla.io.errors import UserError, suggestion
 
 log = logging.getLogger(__name__)
 

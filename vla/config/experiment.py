@@ -92,21 +92,6 @@ class Experiment:
         """Episodes and conditions of an evaluation."""
         return self.build("evaluate")
 
-    @property
-    def task(self) -> Node:
-        """The plain node of the world."""
-        return self.nodes["task"]
-
-    @property
-    def trainer(self) -> Node:
-        """The plain node of Lightning's trainer."""
-        return self.nodes["trainer"]
-
-    @property
-    def held_out(self) -> float:
-        """Share of the episodes that training holds out."""
-        return self.nodes["data"]["validation_fraction"]
-
     def options(self, kind: type[T]) -> T:
         """Build the node of the job itself, of class `kind`."""
         name = self.settings.job.rpartition(".")[2]
@@ -160,7 +145,7 @@ class Experiment:
 
     def make_environment(self, changes: Mapping[str, Any] | None = None) -> Callable[[], Environment]:
         """Return the factory of the environment, with the `changes` of a condition."""
-        return partial(make_environment, with_changes(self.task, changes or {}))
+        return partial(make_environment, with_changes(self.nodes["task"], changes or {}))
 
     def make_expert(self) -> Callable[[Environment], Agent]:
         """Return the factory of the expert for an environment."""

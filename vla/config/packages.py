@@ -103,17 +103,13 @@ def trusting(packages: Sequence[str]) -> Iterator[None]:
     for name in packages:
         _require_trustworthy("trust", name)
     before = os.environ.get(TRUSTED)
-    _trust_also(packages)
+    os.environ[TRUSTED] = ",".join(sorted({*trusted(), *packages}))
     try:
         yield
     finally:
         del os.environ[TRUSTED]
         if before is not None:
             os.environ[TRUSTED] = before
-
-
-def _trust_also(names: Iterable[str]) -> None:
-    os.environ[TRUSTED] = ",".join(sorted({*trusted(), *names}))
 
 
 def trusted() -> list[str]:

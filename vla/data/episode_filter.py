@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from vla.data.index import Entry
-from vla.io.errors import UserError
-from vla.io.suggestion import suggestion
+from vla.io.errors import UserError, suggestion
 
 FACTS = ("seed", "task", "instruction", "outcome", "steps")
 

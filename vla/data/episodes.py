@@ -28,7 +28,7 @@ from filelock import FileLock, Timeout
 
 from vla.data.fields import Field, Rows, ScatteredRows
 from vla.data.header import Codec, fields_of, is_store, read_header, write_header
-from vla.data.index import REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
+from vla.data.index import INDEX, REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
 from vla.data.statistics import Statistics
 from vla.io.documents import canonical
 from vla.io.errors import UserError
@@ -76,7 +76,7 @@ class EpisodeStore:
         self.codec: Codec = self.header.codec
         self._columns = {name: Field(self.folder, name, *row, self.codec) for name, row in self.fields.items()}
         self._limit, self._damaged = episodes, damaged
-        self._index, self._files = self.folder / "index.jsonl", dict[Path, BinaryIO]()
+        self._index, self._files = self.folder / INDEX, dict[Path, BinaryIO]()
         self._refresh()
         if episodes is not None and len(self.episodes) < episodes:
             raise UserError(f"{folder} holds {len(self.episodes)} of {episodes} episodes: collect the rest first")

@@ -17,6 +17,7 @@ from vla.io.errors import UserError
 from vla.io.types import Seed
 from vla.spec import LONGEST_INSTRUCTION, Name
 
+INDEX = "index.jsonl"  # in the folder of a store
 REMEDY = "copy the folder again from where it is whole, or delete it and collect again"
 SALVAGE = f"keep what is whole with job=inspect inspect.repair=true, {REMEDY}"
 DAMAGED = "damaged"  # outcome of a seed whose episode a repair could not save

@@ -72,12 +72,7 @@ class WindowBatcher:
     """
 
     def __init__(
-        self,
-        store: EpisodeStore,
-        history: int,
-        chunk: int,
-        pin: bool = False,
-        truth_size: int | None = None,
+        self, store: EpisodeStore, history: int, chunk: int, pin: bool = False, truth_size: int | None = None
     ) -> None:
         self._pin, self._buffers = pin, BufferPool()
         self._ages, self._aheads = np.arange(1 - history, 1), np.arange(chunk)

@@ -1,6 +1,9 @@
-"""The error of whatever a user can mend."""
+"""The error of whatever a user can mend, and the suggestion for a misspelt name."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 
 class UserError(ValueError):
@@ -8,3 +11,9 @@ class UserError(ValueError):
 
     The entry point prints the text alone. Every other exception is a bug and keeps its traceback.
     """
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Return `, did you mean …?`, or an empty string without a similar name."""
+    close = get_close_matches(name, list(known), n=1)
+    return f", did you mean {close[0]}?" if close else ""

@@ -5,6 +5,7 @@ In a world of recordings there is no success to measure, only errors of actions:
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -18,6 +19,7 @@ from vla.config.build import Group, build
 from vla.config.differences import NOT_COMPARED
 from vla.config.experiment import Experiment
 from vla.config.nodes import NEAREST, with_changes
+from vla.data.index import INDEX
 from vla.io.errors import UserError
 from vla.io.files import warn_on_error, writing
 from vla.io.printable import printable, show
@@ -32,7 +34,7 @@ from vla.rollouts.comparison import compare_conditions
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.memorisation import make_nearest, make_without, open_memory
 from vla.rollouts.realtime import make_over_network
-from vla.rollouts.recordings import clear, keep_recordings
+from vla.rollouts.recordings import clear, keep_pictures, merge_recordings
 from vla.rollouts.results import Report
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory
 from vla.rollouts.shared_policy import shared_policy
@@ -80,7 +82,7 @@ def _trained(experiment: Experiment) -> Path | None:
     """Train; return None in all but the first process, or if no episodes are left to evaluate on."""
     from vla.jobs.train import train
 
-    if experiment.playable or experiment.held_out:
+    if experiment.playable or experiment["data"]["validation_fraction"]:
         return train(experiment)
     log.warning("data.validation_fraction=0 trains on all episodes and leaves none to evaluate the policy on")
     train(experiment)
@@ -90,8 +92,8 @@ def _trained(experiment: Experiment) -> Path | None:
 def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
     """Return the success rate of a policy, or of the agent of the config.
 
-    A finished evaluation is kept, and of an unfinished one the episodes that were played. If an episode ended in an
-    error the report is written and contains it, then a UserError is raised.
+    A finished evaluation of a policy is kept, and of an unfinished one the episodes that were played. If an episode
+    ended in an error the report is written and contains it, then a UserError is raised.
     """
     output = experiment.output
     if checkpoint and (known := cached_success(output, experiment.config, checkpoint)) is not None:
@@ -99,11 +101,9 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
     statements, conclusions = _statements(experiment), list[str]()
     _ = experiment.origin  # of the code that is evaluated, not of later changes
     try:
-        with (
-            Played(output, _identity(experiment, checkpoint)) as played,
-            policy_for_workers(experiment, checkpoint) as make_policy,
-        ):
-            reports = _play(experiment, make_policy, statements, played)
+        with Played(output, _identity(experiment, checkpoint)) as played:
+            with policy_for_workers(experiment, checkpoint) as make_policy:
+                reports = _play(experiment, make_policy, statements, played)
             report = reports[IN_DISTRIBUTION]
             said = [each.say(report) for each in statements]
             conclusions += [*said, str(report)]
@@ -121,7 +121,9 @@ def _identity(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]
     """Return what determines the results of an evaluation."""
     config = {name: node for name, node in experiment.config.items() if name not in NOT_COMPARED}
     weights = read_policy(checkpoint).training.weights if checkpoint else None
-    return {"weights": weights, "versions": installed_versions(), "config": config}
+    nearest = experiment.evaluate.nearest
+    replayed = hashlib.sha256((Path(nearest) / INDEX).read_bytes()).hexdigest() if nearest else None
+    return {"weights": weights, "versions": installed_versions(), "config": config, "replayed": replayed}
 
 
 @contextmanager
@@ -150,7 +152,7 @@ def _conditions(experiment: Experiment, make_agent: AgentFactory) -> dict[str, t
     wanted, world = experiment.evaluate, experiment.make_environment()
     found = {IN_DISTRIBUTION: (world, make_agent)}
     for name, changes in wanted.changes.items():
-        if with_changes(experiment.task, changes) != experiment.task:
+        if with_changes(experiment["task"], changes) != experiment["task"]:
             found[name] = experiment.make_environment(changes), make_agent
     for each in wanted.without:
         found[f"without_{each}"] = world, partial(make_without, make_agent, each)
@@ -194,7 +196,7 @@ def _play(
         if first:
             seeds = [result.seed for result in reports[name].results]
             until = partial(differs_clearly, reports[name], wanted.margin, len(conditions) - 1)
-    tiers = experiment.task.get("tiers") or {}  # of worlds that have them
+    tiers = experiment["task"].get("tiers") or {}  # of worlds that have them
     reports = {name: replace(report, tiers=tiers) for name, report in reports.items()}
     # A condition that changes nothing is the first one.
     return {name: reports.get(name, reports[IN_DISTRIBUTION]) for name in (IN_DISTRIBUTION, *wanted.changes, *reports)}
@@ -261,7 +263,7 @@ def _against(experiment: Experiment, run: str) -> AgainstRun:
     if report is None:
         raise UserError(f"evaluate.against={run} has no report.json to compare with: evaluate that run first")
     theirs = {result.seed: result for result in report.per_episode}
-    if not any(result.draws for result in report.per_episode) and report.config.get("task") != experiment.task:
+    if not any(result.draws for result in report.per_episode) and report.config.get("task") != experiment["task"]:
         theirs = {}  # without draws to compare, equal seeds are the same episodes in the same task only
     statement = AgainstRun(run, theirs, experiment.evaluate.margin, report.anytime)
     statement.require_common(experiment.evaluate.seeds)
@@ -279,7 +281,7 @@ def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, R
         earlier.unlink(missing_ok=True)
     if experiment["recorder"] and not _errors(reports):  # else the same command continues
         with warn_on_error(recording):
-            facts["recorded"] = keep_recordings(report, output / RECORDINGS, recording, wanted.recordings)
+            facts["recorded"] = merge_recordings(report, output / RECORDINGS, recording, wanted.recordings)
     with warn_on_error(output / PLOT):
         (output / PLOT).unlink(missing_ok=True)  # of an earlier evaluation
         plot_report(report, output / PLOT)
@@ -293,6 +295,9 @@ def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, R
     used = str(checkpoint) if checkpoint else None
     # Last, because its existence marks the evaluation as finished.
     write_report(report, output / REPORT, used, experiment.config, facts, others, compared)
+    if "recorded" in facts:  # only now: without a report the same command merges them again
+        with warn_on_error(output / RECORDINGS):
+            keep_pictures(report, output / RECORDINGS, wanted.recordings)
     page = None
     with warn_on_error(output / PAGE):
         page = write_page(output)

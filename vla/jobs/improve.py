@@ -14,7 +14,7 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 
-from vla.config.adopt import require_identity
+from vla.config.adopt import LAST, require_identity
 from vla.config.check import devices
 from vla.config.differences import at
 from vla.config.experiment import Experiment
@@ -92,7 +92,9 @@ def _require_possible(experiment: Experiment) -> range:
     seeds = asked.seeds
     if seeds.stop > FIRST_SEED:
         raise UserError(f"improve.seed={seeds.start}: seeds from {FIRST_SEED} on are reserved for evaluation")
-    if devices(experiment.trainer) > 1:
+    if (Path(experiment.settings.output) / LAST).exists():
+        raise UserError(f"{experiment.settings.output} has a training without rounds: choose another output=DIR")
+    if devices(experiment["trainer"]) > 1:
         raise UserError("job=improve trains on one device, because its trainings follow each other: trainer.devices=1")
     if experiment.pretrained is not None:
         _require_further_episodes(experiment, experiment.pretrained)
@@ -134,7 +136,7 @@ def require_new(seeds: range, store: EpisodeStore) -> None:
 def _labelled(experiment: Experiment, checkpoint: Path, folder: Path, seed: int) -> EpisodeStore:
     """Return the store of a round: episodes of the policy in a checkpoint, labelled by the expert; add missing ones."""
     asked = experiment.options(Rounds)
-    task = with_changes(experiment.task, asked.changes)
+    task = with_changes(experiment["task"], asked.changes)
     environment = experiment.make_environment(asked.changes)
     own = {
         "task": task,
@@ -154,7 +156,7 @@ def _labelled(experiment: Experiment, checkpoint: Path, folder: Path, seed: int)
 
 def _round(experiment: Experiment, checkpoint: Path, folder: Path, stores: Sequence[Path]) -> Experiment:
     """Return the training of a round: from the weights of the one before, on demonstrations and all rounds so far."""
-    steps, batches = experiment.options(Rounds).steps, experiment.trainer["accumulate_grad_batches"]
+    steps, batches = experiment.options(Rounds).steps, experiment["trainer"]["accumulate_grad_batches"]
     more = [*(experiment.collect.more or ()), *map(str, stores)]
     return experiment.with_values(
         {

@@ -32,7 +32,7 @@ def run(experiment: Experiment) -> None:
     else:
         if others := [name for name in ("stores", "where", "repair", "into") if getattr(wanted, name)]:
             raise UserError(f"inspect.episode replays an episode of inspect.folder: omit inspect.{others[0]}")
-        robot, recorded = experiment.task.get("robot"), experiment["recorder"] is not None
+        robot, recorded = experiment["task"].get("robot"), experiment["recorder"] is not None
         replay_episode(experiment.output, Path(wanted.folder), wanted.episode, robot, recorded)
 
 

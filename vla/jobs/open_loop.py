@@ -41,7 +41,8 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     output, folder = experiment.output, Path(experiment.collect.folder)
     facts: dict[str, Any] = {**experiment.settings.chosen, "origin": asdict(experiment.origin)}
     fraction = _held_out(experiment, checkpoint)  # before an import
-    store = EpisodeStore(folder, experiment.collect.episodes) if is_store(folder) else demonstrations(experiment)
+    known = checkpoint is not None and is_store(folder)  # else an import is compared with its dataset
+    store = EpisodeStore(folder, experiment.collect.episodes) if known else demonstrations(experiment)
     if checkpoint is None:
         make_agent: Any = experiment.make_agent()
         policy = make_agent(experiment.world())
@@ -73,7 +74,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
 
 def _held_out(experiment: Experiment, checkpoint: Path | None) -> float:
     """Return the share of episodes that training holds out, or held out; a UserError if there are none."""
-    fraction, whose = experiment.held_out, "a training would be"
+    fraction, whose = experiment["data"]["validation_fraction"], "a training would be"
     if checkpoint is not None:
         saved, whose = read_policy(checkpoint), f"{checkpoint} was trained"
         trained, world = saved.spec.without_truth, experiment.world().spec.without_truth

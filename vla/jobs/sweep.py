@@ -32,7 +32,7 @@ class SweepTable(Callback):
 
             if job_return.status == JobStatus.COMPLETED:  # from a concurrent sweep in this folder
                 (Path(config.hydra.runtime.output_dir) / FAILURE).unlink(missing_ok=True)
-            from vla.reports.sweep import tabulate  # imports matplotlib
+            from vla.reports.comparison_page import tabulate  # imports matplotlib
 
             folder = Path(config.hydra.sweep.dir)
             with FileLock(folder / ".lock"):  # the last holder of the lock writes all cells

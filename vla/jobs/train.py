@@ -22,7 +22,7 @@ from vla.jobs.collect import demonstration_spec, demonstrations
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.models.policy_folder import POLICY
-from vla.models.tokenizers.tokenization_error import out_of_bounds, rounding
+from vla.models.tokenizers.tokenizer import out_of_bounds, rounding
 from vla.models.trunk import is_within, trunks
 from vla.parallel.limits import cores
 from vla.reports.observations import SHOWN, draw_samples
@@ -66,7 +66,7 @@ def train(experiment: Experiment) -> Path | None:
         return chosen if first_process() else None
     quiet_lightning()
     graceful_stop, closed_loop = GracefulStop(output / CHECKPOINTS), _closed_loop(experiment)
-    if experiment.trainer["max_steps"] in (None, -1) and experiment["learner"]["schedule"] == "cosine":
+    if experiment["trainer"]["max_steps"] in (None, -1) and experiment["learner"]["schedule"] == "cosine":
         log.warning("without trainer.max_steps learner.schedule=cosine has no end: the learning rate stays at its peak")
     with closed_loop or nullcontext(), training_lock(output / CHECKPOINTS):
         # Before collection, so that missing devices are reported early.

@@ -116,10 +116,6 @@ class DenoisingModel(ContextModel):
     def sample(self, noise: Tensor, denoise: Denoise) -> Tensor:
         """Denoise (B, k, D) noise to scaled actions, (B, k, D), in several steps."""
 
-    def sample_noise(self, random: torch.Generator) -> Tensor:
-        """Sample standard normal noise, (1, k, D)."""
-        return torch.randn(1, *self.noise.shape, generator=random)
-
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return context: (B, M, E), padding: (B, M) unless there is none, and the result of `predict_truth`."""
         encoded = self.encoded(batch)

@@ -21,7 +21,7 @@ from vla.models.kinematics import RobotState
 from vla.models.layers import Batch, RunningNormalizer, mean_where, newest
 from vla.models.text.ngrams import TextEncoder
 from vla.models.tokenizers.tokenizer import ActionTokenizer, PerComponent
-from vla.models.transforms import Fit, Resize, Transforms
+from vla.models.transforms import Fit, Transforms
 from vla.models.trunk import is_factor, is_within
 from vla.models.vision.image_tokenizer import ImageEncoder, RandomShift
 from vla.spec import Spec
@@ -65,6 +65,7 @@ class Model(nn.Module, ABC):
         UserError: `execute` exceeds `chunk`.
     """
 
+    noise: Tensor | None  # (k, …) standard normal, of predictions whose batch has none; None: deterministic
     history = 1  # T, number of frames in the input
     continues = False  # whether its plans can continue running ones, by a `chunking` that the policy sets
     chunking: Chunking | None = None
@@ -87,6 +88,7 @@ class Model(nn.Module, ABC):
         tokenizer: ActionTokenizer,
     ) -> None:
         super().__init__()
+        self.register_buffer("noise", None, persistent=False)
         self.chunk, self.execute = chunk, chunk if execute is None else execute
         if self.execute > chunk:
             raise UserError(f"model.execute={execute} is more than the model.chunk={chunk} actions that are predicted")
@@ -94,7 +96,7 @@ class Model(nn.Module, ABC):
         self.text = text(width=text_width)
         sizes = [spec.image_size, *([image_size] if image_size else [])]
         self.image_size = sizes[-1]
-        self.transforms = Transforms(tuple(Resize((size[0], size[1]), fit) for size in sizes), self.text.tokenize)
+        self.transforms = Transforms(tuple((size[0], size[1]) for size in sizes), fit, self.text.tokenize)
         self.shift = RandomShift(*shift)
         self.robot_state = RobotState(spec)
         self.add_truth_head(width, auxiliary)
@@ -122,8 +124,8 @@ class Model(nn.Module, ABC):
         return None
 
     def sample_noise(self, random: torch.Generator) -> Tensor | None:
-        """Sample the "noise" of one prediction, (1, k, D); None for a deterministic model."""
-        return None
+        """Sample the "noise" of one prediction, (1, k, …), standard normal; None for a deterministic model."""
+        return None if self.noise is None else torch.randn(1, *self.noise.shape, generator=random)
 
     def predict_truth(self, features: Tensor) -> dict[str, Tensor]:
         """Return truth: (B, T', S), normalised, given (B, T', width) features; nothing without an auxiliary head."""

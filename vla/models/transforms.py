@@ -15,44 +15,34 @@ from vla.models.layers import Batch
 
 
 @dataclass(frozen=True)
-class Resize:
-    """Images of any size and aspect ratio → images of one size, bilinear and antialiased, on the device of the images.
-
-    Args:
-        size: height and width [px].
-        fit: for another aspect ratio, "crop" to the centre, "pad" with black borders, or "stretch".
-    """
-
-    size: tuple[int, int]
-    fit: Fit
-
-    def __call__(self, images: Tensor) -> Tensor:
-        """Resize (B, T, H, W, 3) uint8 images; those of the size are returned as they are."""
-        if tuple(images.shape[2:4]) == self.size:
-            return images
-        return fitted(images.flatten(0, 1), self.size, self.fit).unflatten(0, images.shape[:2])
-
-
-@dataclass(frozen=True)
 class Transforms:
-    """The list of steps, which a policy has in its configuration as `model.image_size` and `model.fit`.
+    """The steps, which a policy has in its configuration as `model.image_size` and `model.fit`.
 
     Images are brought to the size of the demonstrations first, so that a sharper camera shows no more than training
     did. Numbers are normalised within the model, by statistics that are saved with its weights, and absent frames of a
     window are zero.
 
     Args:
-        images: steps on the images of every camera.
+        sizes: height and width of the images of every camera, one after the other [px].
+        fit: for another aspect ratio, "crop" to the centre, "pad" with black borders, or "stretch".
         tokenize: sentences → tokens.
     """
 
-    images: tuple[Resize, ...]
+    sizes: tuple[tuple[int, int], ...]
+    fit: Fit
     tokenize: Callable[[list[str]], Tensor]
 
     def __call__(self, batch: Batch) -> Batch:
         """Return the input of a model: its images have `image_size`, and "text" is there, made of "instruction"."""
         rgb = dict(batch["rgb"])
-        for step in self.images:
-            rgb = {camera: step(values) for camera, values in rgb.items()}
+        for size in self.sizes:
+            rgb = {camera: resized(images, size, self.fit) for camera, images in rgb.items()}
         text = batch["text"] if "text" in batch else self.tokenize(batch["instruction"]).to(batch["state"].device)
         return {**batch, "rgb": rgb, "text": text}
+
+
+def resized(images: Tensor, size: tuple[int, int], fit: Fit) -> Tensor:
+    """Resize (B, T, H, W, 3) uint8 images as `vla.io.images.fitted`; those of the size are returned as they are."""
+    if images.shape[2:4] == size:
+        return images
+    return fitted(images.flatten(0, 1), size, fit).unflatten(0, images.shape[:2])

@@ -124,10 +124,10 @@ def _outcome(function: Callable[..., Any], *arguments: Any) -> bytes:
     try:
         return pickle.dumps((function(*arguments), None, ""))
     except Exception as error:  # of any kind, that of pickling included: the parent raises it
-        return pickle.dumps((None, _portable(error), traceback.format_exc()))
+        return pickle.dumps((None, portable(error), traceback.format_exc()))
 
 
-def _portable(error: Exception) -> Exception:
+def portable(error: BaseException) -> BaseException:
     """Return the error, or a RuntimeError with its text if it cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(error))

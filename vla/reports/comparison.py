@@ -139,9 +139,11 @@ def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
 
 
 def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
-    """Return the config values that determine the scenes: the task, and the changes of a condition."""
-    config = run.report.config if run.report else {}
-    return at(config, "task"), _changes(run, condition), at(config, "evaluate.networks", {}).get(condition)
+    """Return the config values that determine the scenes: the task with the changes of a condition, and its network."""
+    config, changes = run.report.config if run.report else {}, _changes(run, condition)
+    task = at(config, "task")
+    changed = with_changes(task, changes) if changes and isinstance(task, dict) else task
+    return changed, changes is None, at(config, "evaluate.networks", {}).get(condition)
 
 
 def _changes(run: Run, condition: str) -> dict[str, Any] | None:

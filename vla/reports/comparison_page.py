@@ -1,4 +1,4 @@
-"""The page that compares rows, `comparison.html` of runs and `sweep.html` of a sweep."""
+"""The page that compares rows, `comparison.html` of runs and `sweep.html` of a sweep, and a sweep's other files."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 
 from vla.config.differences import ABSENT, at, differences
-from vla.reports.comparison import Compared, difference_tables
+from vla.io.files import warn_on_error, write_text
+from vla.reports.comparison import Compared, compare, difference_tables, remarks
 from vla.reports.page import Section, render
-from vla.reports.pictures import COLOURS, Panels, error_bars, plot_rates, svgs
+from vla.reports.pictures import COLOURS, Panels, error_bars, plot_rates, save, svgs
 from vla.reports.tables import Table, config_value, duration, links, percent, rate
 from vla.reports.training_curves import training_sections
 from vla.rollouts.recordings import pictured, shown
 from vla.runs.folder import PAGE, RECORDING, RECORDINGS, Run
-from vla.runs.sweep import DEMONSTRATIONS, SweepRow, conditions_of
+from vla.runs.sweep import DEMONSTRATIONS, SweepRow, conditions_of, failures, read_rows
 
 COMPARISON, SWEEP = "comparison.html", "sweep.html"
 CONDITIONS = 4  # maximum number of conditions on a terminal
@@ -28,7 +29,7 @@ FAILURES = 3  # moving pictures per run
 
 
 def write_comparison(
-    page: Path, title: str, rows: Sequence[SweepRow], compared: Compared, remarks: Mapping[str, str]
+    page: Path, title: str, rows: Sequence[SweepRow], compared: Compared, facts: Mapping[str, str]
 ) -> Path:
     """Write a page on rows and their comparisons, and return its path; a UserError if a moving picture is damaged.
 
@@ -41,7 +42,7 @@ def write_comparison(
     few = {name: run for name, _, run in cells} if len(cells) <= len(COLOURS) else {}
     parts = [
         results_table(rows, page.parent),
-        Section("Remarks", facts=remarks),
+        Section("Remarks", facts=facts),
         Section("Success", panels=svgs(success_panels(rows)), lines=legend),
         *difference_tables(compared),
         *training_sections([(colour, run.metrics) for _, colour, run in cells]),
@@ -49,6 +50,25 @@ def write_comparison(
         *(_failures(name, run) for name, run in few.items()),
     ]
     return render(page, title, parts, any(report.anytime for _, _, run in cells for report in run.reports.values()))
+
+
+def tabulate(folder: Path) -> list[SweepRow]:
+    """Write the table of a sweep's folder and return its rows; without any report, write nothing."""
+    rows = read_rows(folder)
+    if rows:
+        margin = at(rows[0].runs[0].config, "evaluate.margin", 0.0)
+        compared = compare(((rows[0], other) for other in rows[1:]), margin)
+        failed = failures(folder)
+        tables = [results_table(rows), *(difference_tables(compared)[:1] if compared else [])]
+        texts = [*(table.markdown() for table in tables), "".join(f"- failed: {line}\n" for line in failed)]
+        write_text(folder / "sweep.md", "\n".join(filter(None, texts)))
+        size = 4, max(2.5, 0.5 + 0.25 * len(rows))
+        save(folder / "sweep.png", success_panels(rows), 4, size, "success, 95 % CI")
+        with warn_on_error(folder / SWEEP):
+            facts = {f"failed cell {number}": line for number, line in enumerate(failed, 1)}
+            facts |= remarks({run.folder.name: run for row in rows for run in row.runs})
+            write_comparison(folder / SWEEP, f"Sweep {folder.resolve().name}", rows, compared, facts)
+    return rows
 
 
 def results_table(rows: Sequence[SweepRow], folder: Path | None = None) -> Table:

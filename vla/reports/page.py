@@ -19,12 +19,12 @@ from vla.rollouts.moving_picture import LARGEST
 from vla.rollouts.results import Result
 
 WILSON = "Wilson's; those of several trainings account for correlation within trainings and within scenes"
-ANYTIME = "anytime-valid, by betting, because playing stopped as soon as it was clear"
+EXACT = "of McNemar's exact test on episodes with the same seeds, and of Fisher's on others, with Newcombe's intervals"
+EARLY = "by betting, valid at any time, where playing stopped as soon as it was clear, and else"
 NOTES = (
-    "Rates have 95 % confidence intervals ({}). p is of McNemar's exact test on episodes with the same seeds, and of "
-    "Fisher's on others, with Newcombe's intervals; p Holm is adjusted for all comparisons in the table, so that at "
-    "most 5 % of tables have a false difference. The verdict is a difference with p Holm of at most 0.05, not worse if "
-    "the interval, which is not adjusted, excludes a loss of that many percentage points, and open otherwise."
+    "Rates have 95 % confidence intervals ({}). p is {}; p Holm is adjusted for all comparisons in the table, so that "
+    "at most 5 % of tables have a false difference. The verdict is a difference with p Holm of at most 0.05, not worse "
+    "if the interval, which is not adjusted, excludes a loss of that many percentage points, and open otherwise."
 )
 
 
@@ -62,7 +62,7 @@ def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bo
         title=title,
         parts=[part for part in parts if part.rows],
         written=f"{datetime.now():%Y-%m-%d %H:%M}",
-        notes=NOTES.format(ANYTIME if anytime else WILSON),
+        notes=NOTES.format(*(f"{EARLY} {each}" if anytime else each for each in (WILSON, EXACT))),
         **content,
     )
     write_text(path, text)

@@ -81,9 +81,11 @@ def _play_missing(
         bar = progress.add_task("", total=len(score.seeds), completed=len(score.results))
         missing = [] if score.clear() else [seed for seed in score.seeds if seed not in score.results]
         groups = [missing[first : first + size] for first in range(0, len(missing), size)]
-        group_of = {pool.submit((group, recorded)): group for group in groups}
+        group_of, crashed = {pool.submit((group, recorded)): group for group in groups}, False
         for future in pool.as_completed(group_of):
-            for result in _results(pool, future, group_of[future], recorded):
+            results = _results(future, group_of[future])
+            crashed |= not results
+            for result in results:
                 score.results[result.seed] = result
                 if result.outcome != ERROR:
                     keep(result)
@@ -92,6 +94,8 @@ def _play_missing(
                 for later in group_of:
                     later.cancel()
                 return
+    if crashed:  # each of the episodes that were played side by side alone
+        _play_missing(pool, score, recorded, 1, name, keep)
 
 
 @dataclass
@@ -123,15 +127,13 @@ class _Score:
         return f"success {100 * so_far.success:.0f} %{errors}"
 
 
-def _results(pool: Pool, future: Future, seeds: Sequence[int], recorded: bool) -> list[Result]:
-    """Return the results of episodes that were played side by side; if the process crashed, play each of them alone."""
+def _results(future: Future, seeds: Sequence[int]) -> list[Result]:
+    """Return the results of episodes that were played side by side; none if their process crashed, but of a single
+    one an error."""
     try:
         return future.result()
     except Crashed as crash:
-        if len(seeds) == 1:
-            return [Result(seeds[0], ERROR, error=str(crash))]
-        alone = [pool.submit(([seed], recorded)) for seed in seeds]
-        return [_results(pool, one, [seed], recorded)[0] for one, seed in zip(alone, seeds, strict=True)]
+        return [Result(seeds[0], ERROR, error=str(crash))] if len(seeds) == 1 else []
 
 
 def _record(pool: Pool, results: Sequence[Result]) -> None:
@@ -139,10 +141,7 @@ def _record(pool: Pool, results: Sequence[Result]) -> None:
     expected = {pool.submit(([result.seed], True)): result for result in results}
     for future in pool.as_completed(expected):
         result = expected[future]
-        try:
-            again = future.result()[0]
-        except Crashed as crash:
-            again = Result(result.seed, ERROR, error=str(crash))
+        (again,) = _results(future, [result.seed])
         if again.outcome != result.outcome:
             ended = again.error or again.outcome
             log.warning("seed %d has no recording: when played again it ended with %s", result.seed, ended)

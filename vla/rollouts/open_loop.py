@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vla.data.index import recording_of
+from vla.io.errors import UserError
 from vla.rollouts.statistics import mean_interval
 from vla.spec import Agent, Array, Episode, Spec
 
@@ -55,6 +56,8 @@ def open_loop(agent: Agent, spec: Spec, episodes: Iterable[Episode], constant: A
     for episode in episodes:
         agent.reset(episode.instruction, episode.seed)
         predicted.append(np.stack([agent.act(observation) for observation in episode.observations]))
+        if predicted[-1].shape[1:] != (len(spec.action),) or not np.isfinite(predicted[-1]).all():
+            raise UserError(f"the agent's actions must be {len(spec.action)} finite numbers, as in the spec")
         recorded.append(episode.actions)
         seeds.append(episode.seed)
         recordings.append(recording_of(episode.seed, episode.draws))

@@ -51,20 +51,22 @@ def clear(folder: Path, kept: Container[Path] = ()) -> None:
             file.unlink()
 
 
-def keep_recordings(report: Report, folder: Path, target: Path, wanted: Recordings) -> list[int]:
-    """Merge the `wanted` recordings of an evaluation into one file, failures first; return their seeds.
-
-    Only the moving pictures of the episodes to be `shown` stay in the folder, which is removed if it is empty.
-    """
+def merge_recordings(report: Report, folder: Path, target: Path, wanted: Recordings) -> list[int]:
+    """Merge the `wanted` recordings of an evaluation into one file, failures first; return their seeds."""
     from vla.rollouts.recorder import merge  # imports the viewer's library
 
-    wanted_ones = chosen(report, wanted)
-    files = {each.seed: folder / f"{recording_name(each.seed, each.outcome)}.rrd" for each in wanted_ones}
+    names = {each.seed: recording_name(each.seed, each.outcome) for each in chosen(report, wanted)}
+    files = {seed: folder / f"{name}.rrd" for seed, name in names.items()}
     recorded = [seed for seed, file in files.items() if file.exists()]
     if recorded:
         merge([files[seed] for seed in recorded], target)
+    return recorded
+
+
+def keep_pictures(report: Report, folder: Path, wanted: Recordings) -> None:
+    """Remove what was merged but for the moving pictures of the episodes to be `shown`, and a folder without any."""
+    wanted_ones = chosen(report, wanted)
     pictures = pictured(wanted_ones, folder)
     clear(folder, [pictures[each.seed] for each in shown(each for each in wanted_ones if each.seed in pictures)])
     with suppress(OSError):
         folder.rmdir()
-    return recorded

@@ -151,15 +151,11 @@ class RemotePolicy:
     def plan(self, observation: Observation) -> Array:
         """Return the server's chunk, (k, D) float32, clipped, of which `execute` are meant to act. Raises as `act`."""
         began = time.perf_counter()
-        answer = self.ask(observation)
+        answer = self._ask(self.message(observation))
         self.info = {"answer_ms": 1000 * (time.perf_counter() - began)}
         actions = self._translated(answer.get("actions"))
         self.execute = min(self._wanted or len(actions), len(actions))
         return actions
-
-    def ask(self, observation: Observation) -> dict[str, Any]:
-        """Return the server's answer to an observation. Raises as `act` does."""
-        return self._ask(self.message(observation))
 
     def _ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
         self._broken = True  # until it has answered: after an error, too, a server closes the connection

@@ -23,7 +23,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from vla.io.errors import UserError
-from vla.parallel.processes import one_thread_each
+from vla.parallel.processes import one_thread_each, portable
 from vla.spec import Agents, Array, Environment, Observation, Running, Spec
 
 MOST = 1024  # workers
@@ -51,7 +51,7 @@ def shared_policy(make_policy: Callable[[], _Planner]) -> Iterator[Callable[[Env
             threads.submit(_accept, listener, partial(talks.submit, _talk, policy, requests))
             threads.submit(_serve, policy, requests)
             try:
-                yield partial(_connected, str(listener.address), key)
+                yield partial(_DistantPolicy, str(listener.address), key)
             finally:
                 requests.put(None)
                 with suppress(OSError), Client(listener.address, authkey=key) as last:
@@ -113,7 +113,8 @@ def _talk(
                 asked = (instruction, given) if kind == "reset" else _observation(memory, spec, instruction, given)
                 requests.put((kind, lane, asked, future := Future()))
                 error = future.exception()
-                connection.send(error or (future.result(), policy.about(lane), policy.looking(lane)))
+                done = None if error else (future.result(), policy.about(lane), policy.looking(lane))
+                connection.send(portable(error) if error else done)
     finally:
         memory.close()
         memory.unlink()
@@ -145,15 +146,15 @@ def _views(memory: SharedMemory, spec: Spec) -> dict[str, Array]:
 class _DistantPolicy:
     """The agent of one world whose policy is in another process of this machine."""
 
-    def __init__(self, address: str, key: bytes, spec: Spec) -> None:
+    def __init__(self, address: str, key: bytes, environment: Environment) -> None:
         """Connect to a policy; a UserError if it has another spec than the environment."""
-        self._connection, self._world = Client(address, authkey=key), spec.without_truth
+        self._connection, self._world = Client(address, authkey=key), environment.spec.without_truth
         self._connection.send(self._world)
         name, self.spec, self.execute, self.history = self._connection.recv()
         self.info: dict[str, Any] = {}
         self.looks = True
         try:
-            self.spec.require_input(spec, "the policy", "the task")
+            self.spec.require_input(environment.spec, "the policy", "the task")
         except ValueError:
             self._connection.close()
             raise
@@ -194,7 +195,3 @@ class _DistantPolicy:
         """Leave the policy."""
         self._memory.close()
         self._connection.close()
-
-
-def _connected(address: str, key: bytes, environment: Environment) -> _DistantPolicy:
-    return _DistantPolicy(address, key, environment.spec)

@@ -10,11 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
-from filelock import FileLock, Timeout
-
 from vla.io.documents import parse_json, read_bounded
-from vla.io.errors import UserError
-from vla.io.files import write_text, writing
+from vla.io.files import locked, write_text, writing
 from vla.rollouts.results import Result
 
 LOCK = ".evaluation"  # held by the process that evaluates into a run's folder
@@ -35,13 +32,8 @@ class Played:
         An OSError tells that it cannot be written, a UserError that another process writes it.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        self._lock = FileLock(folder / LOCK, blocking=False)
-        try:
-            self._lock.acquire()
-        except Timeout as error:
-            raise UserError(
-                f"another process evaluates in {folder}: wait for it, or choose another output=DIR"
-            ) from error
+        busy = f"another process evaluates in {folder}: wait for it, or choose another output=DIR"
+        self._lock = locked(folder / LOCK, busy)
         self._path, lines = folder / PLAYED, [_line(head)]
         self.results = defaultdict[str, dict[int, Result]](dict)  # condition → seed → result
         before = read_bounded(self._path, LARGEST).decode("utf-8", "replace") if self._path.is_file() else ""

@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from vla.config.adopt import require_identity
 from vla.config.differences import differences
+from vla.data.index import INDEX
 from vla.io.errors import UserError
+from vla.io.files import locked
 from vla.models.checkpoint import read_header
 from vla.models.policy_folder import POLICY, read_policy
 from vla.runs.folder import CHECKPOINTS, LAST, REPORT, read_report
@@ -56,9 +56,10 @@ def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path) ->
     report = read_report(folder)
     if report is None or report.checkpoint != str(checkpoint):
         return None
-    against = config["evaluate"]["against"]
-    # Since the report the training may have continued, or the run that it compares with have been evaluated again.
-    newer = [checkpoint] if against is None else [checkpoint, Path(against) / REPORT]
+    against, nearest = config["evaluate"]["against"], config["evaluate"]["nearest"]
+    # Since the report the training may have continued, the run that it compares with have been evaluated again, or
+    # more demonstrations been collected.
+    newer = [checkpoint, *([Path(against) / REPORT] if against else []), *([Path(nearest) / INDEX] if nearest else [])]
     if (folder / REPORT).stat().st_mtime < max(path.stat().st_mtime for path in newer):
         return None
     if any(part.errors for part in report.reports.values()) or differences(report.config, config):
@@ -86,13 +87,7 @@ def training_lock(folder: Path) -> Iterator[None]:
         yield
         return
     folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / LOCK, blocking=False)
-    try:
-        lock.acquire()
-    except Timeout as error:
-        raise UserError(
-            f"another process is training in {folder}: wait for it, or choose another output=DIR"
-        ) from error
+    lock = locked(folder / LOCK, f"another process is training in {folder}: wait for it, or choose another output=DIR")
     try:
         yield
     finally:

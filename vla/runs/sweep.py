@@ -49,11 +49,6 @@ class SweepRow:
         return found
 
     @property
-    def successes(self) -> dict[str, int]:
-        """Condition → number of successes over all cells."""
-        return {condition: sum(sum(cell.values()) for cell in cells) for condition, cells in self.played.items()}
-
-    @property
     def episodes(self) -> dict[str, int]:
         """Condition → number of episodes over all cells."""
         return {condition: sum(map(len, cells)) for condition, cells in self.played.items()}
@@ -63,7 +58,8 @@ class SweepRow:
         if len(self.runs) == 1:  # its own: stratified with tiers, anytime-valid where playing stopped early
             report = self.runs[0].reports[condition]
             return (report.success, *report.interval)
-        rate = self.successes[condition] / max(self.episodes[condition], 1)
+        successes = sum(sum(cell.values()) for cell in self.played[condition])
+        rate = successes / max(self.episodes[condition], 1)
         return (rate, *pooled_interval(self.played[condition]))
 
 

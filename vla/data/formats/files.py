@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, Timeout
 from PIL import Image
 
 from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
 from vla.io.documents import read_json
 from vla.io.errors import UserError
-from vla.io.files import write_json, writing
+from vla.io.files import locked, write_json, writing
 from vla.io.printable import track
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster, WorkersLost
@@ -100,11 +99,7 @@ def staging_folder(folder: Path) -> Iterator[Path]:
     """
     place = folder.with_name(f".{folder.name}.unfinished")
     place.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(place / "lock")
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        raise UserError(f"another export to {folder} is under way: wait, or choose another export.folder") from error
+    lock = locked(place / "lock", f"another export to {folder} is under way: wait, or choose another export.folder")
     try:
         with writing(folder):
             yield place

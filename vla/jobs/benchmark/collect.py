@@ -86,7 +86,7 @@ def _keep(store: EpisodeStore, episodes: list[Episode]) -> None:
 
 def _renderers(experiment: Experiment) -> dict[str, Measure]:
     """Measure a step's images by every renderer of the task in turns; one with settings of the user's is "chosen"."""
-    own, choice = experiment.task.get("renderer"), _options()
+    own, choice = experiment["task"].get("renderer"), _options()
     if own is None or own["_target_"] not in [node["_target_"] for node in choice.values()]:
         return {}
     nodes = choice if own in choice.values() else {**choice, "chosen": own}

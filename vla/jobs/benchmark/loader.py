@@ -35,7 +35,7 @@ def loader(experiment: Experiment) -> dict[str, Measure]:
     alone = experiment.with_values({"collect.more": None})  # the floor reads one store
     names = {"loader": model.history, "loader: 1 frame": 1, "loader: 6 frames": 6}
     found = {name: _loading(alone, store, frames, model.chunk) for name, frames in names.items()}
-    if "image_size" in experiment.task:
+    if "image_size" in experiment["task"]:
         found |= _of_large_images(alone.with_values({"task.image_size": [LARGE, LARGE]}), model.chunk)
     return found
 

@@ -118,7 +118,7 @@ class NGrams(TextEncoder):
             left_out = torch.rand(tokens.shape, device=tokens.device) < rate
         else:
             left_out = ~self.heard[rows]
-        return _shifted_left(tokens.masked_fill(left_out, PADDING))
+        return padding_last(tokens.masked_fill(left_out, PADDING), PADDING)
 
     def _rows(self, hashes: Tensor) -> Tensor:
         """Return the rows of the embedding for hashes below 2^31."""
@@ -164,11 +164,11 @@ def _character_ngrams(words: list[str]) -> list[str]:
     return [f"#{word[i : i + CHARACTERS]}" for word in marked for i in range(len(word) - CHARACTERS + 1)]
 
 
-def _shifted_left(tokens: Tensor) -> Tensor:
-    """Move the padding of (B, W) tokens to the end of each row."""
+def padding_last(tokens: Tensor, padding: int) -> Tensor:
+    """Move the padding of (B, L) tokens to the end of each row."""
     length = tokens.shape[1]
     places = torch.arange(length, device=tokens.device)
-    return tokens.gather(1, torch.where(tokens == PADDING, places + length, places).argsort(1))
+    return tokens.gather(1, torch.where(tokens == padding, places + length, places).argsort(1))
 
 
 def _hashed_ngrams(tokens: Tensor, longest: int) -> Tensor:

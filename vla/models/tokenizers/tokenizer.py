@@ -261,5 +261,20 @@ def data_bounds(spec: Spec, statistics: ActionStatistics | None, margin: float =
     return (low + high) / 2 - half, (low + high) / 2 + half
 
 
+def out_of_bounds(tokenizer: ActionTokenizer, chunks: np.ndarray) -> float:
+    """Return the share of (N, k, D) values outside the bounds of a tokenizer by more than a rounding error."""
+    actions, slack = torch.from_numpy(np.array(chunks, np.float32)), 1e-4 * (tokenizer.high - tokenizer.low)
+    return float(((actions < tokenizer.low - slack) | (actions > tokenizer.high + slack)).float().mean())
+
+
+def rounding(tokenizer: ActionTokenizer, chunks: np.ndarray, spec: Spec) -> tuple[str, float]:
+    """Return the component of (N, k, D) chunks that loses most as tokens, and its mean error, a share of its range."""
+    actions = torch.from_numpy(np.array(chunks, np.float32))
+    error = (tokenizer.detokenize(tokenizer.tokenize(actions)) - actions).abs().mean((0, 1)).numpy()  # (D,)
+    span = np.maximum(chunks.max((0, 1)) - chunks.min((0, 1)), MIN_SPAN * (np.array(spec.high) - np.array(spec.low)))
+    worst = int((error / span).argmax())
+    return spec.action[worst], float(error[worst] / span[worst])
+
+
 def _hard_cross_entropy(logits: Tensor, token: Tensor) -> Tensor:
     return F.cross_entropy(logits.flatten(0, -2), token.flatten(), reduction="none").view(token.shape)

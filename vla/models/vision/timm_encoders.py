@@ -14,8 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.io.documents import lines_of
-from vla.io.errors import UserError
-from vla.io.suggestion import suggestion
+from vla.io.errors import UserError, suggestion
 from vla.io.types import Pixels, Width
 from vla.models.hub import fetch
 from vla.models.packaged import PackagedFile

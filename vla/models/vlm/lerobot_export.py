@@ -14,7 +14,6 @@ from vla.models.trunk_folder import CONFIG
 from vla.models.vlm.network import renamed
 from vla.models.vlm.normalizer import EPSILON, Normalizer
 from vla.models.vlm.policy import VisionLanguageAction
-from vla.models.vlm.prompt import Prompt
 from vla.models.vlm.trunk import IMAGES, NORMALIZER, PREPROCESSOR
 
 POSTPROCESSOR = "policy_postprocessor.json"
@@ -49,7 +48,7 @@ class LeRobotPolicyExporter:
         model = policy.model
         if not isinstance(model, VisionLanguageAction):
             raise UserError(f"LeRobot has no {type(model).__name__}: this export is of model=smolvla, pi0 and pi05")
-        if _prompt(model).name is None:
+        if model.text.name is None:
             raise UserError("LeRobot reads a sentence with a tokenizer: train with model.text.name")
         beginnings = [(ours, theirs) for theirs, ours in model.network.published]
         state = model.network.state_dict()
@@ -70,7 +69,7 @@ class LeRobotPolicyExporter:
 def _config(model: VisionLanguageAction) -> dict[str, Any]:
     inputs, outputs = _features(model)
     network, mode = model.network, MODES[model.action_normalizer.kind]
-    trunk = {"vlm_model_name": _prompt(model).name} if network.kind == "smolvla" else {}
+    trunk = {"vlm_model_name": model.text.name} if network.kind == "smolvla" else {}
     return {
         "type": network.kind,
         "input_features": inputs,
@@ -80,7 +79,7 @@ def _config(model: VisionLanguageAction) -> dict[str, Any]:
         "normalization_mapping": {"VISUAL": "IDENTITY", "STATE": mode, "ACTION": mode},
         "max_state_dim": network.state_width or network.action_width,
         "max_action_dim": network.action_width,
-        "tokenizer_max_length": _prompt(model).length,
+        "tokenizer_max_length": model.text.length,
         **network.options(),
         **trunk,
     }
@@ -95,7 +94,7 @@ def _features(model: VisionLanguageAction) -> tuple[dict[str, Any], dict[str, An
 
 
 def _preprocessing(model: VisionLanguageAction) -> list[dict[str, Any]]:
-    prompt = _prompt(model)
+    prompt = model.text
     tokens = {"max_length": prompt.length, "task_key": "task", "padding_side": "right", "padding": "max_length"}
     reader = "prepare_state_tokenizer_processor_step" if prompt.state else "new_line_processor"
     inputs, outputs = _features(model)
@@ -132,8 +131,3 @@ def _statistics(model: VisionLanguageAction) -> dict[str, Tensor]:
         for feature, normalizer in parts.items()
         for name, value in normalizer.state_dict().items()
     }
-
-
-def _prompt(model: VisionLanguageAction) -> Prompt:
-    assert isinstance(model.text, Prompt)
-    return model.text

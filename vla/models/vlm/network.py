@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from transformers.models.llama.modeling_llama import apply_rotary_pos_emb
 
 from vla.io.errors import UserError
+from vla.io.types import Count, Layers, Width
 
 MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the embedding of a time
 
@@ -104,6 +105,18 @@ class FlowNetwork(nn.Module, ABC):
     velocity reach the trunk through its keys and values.
 
     A subclass is built as `network()` by the factory of a YAML node: all sizes are its arguments.
+
+    Args:
+        vocabulary: number of tokens of the sentence.
+        width, layers, heads, head_width, feedforward: of the language model.
+        vision_width, vision_layers, vision_heads, vision_feedforward: of the image encoder, a vision transformer.
+        resolution: height and width of an image [px].
+        patch: height and width of a patch [px].
+        expert_width, expert_feedforward: of the expert, whose layers and heads are those of the language model.
+        action_width: A, padded with zeros.
+
+    Raises:
+        UserError: sizes do not divide each other.
     """
 
     # How published weights are named, those of a whole policy of LeRobot and those of the vision-language model alone:
@@ -114,11 +127,40 @@ class FlowNetwork(nn.Module, ABC):
 
     kind: ClassVar[str] = ""  # LeRobot's name of the policy
 
-    resolution: int  # height and width of an image [px]
     state_width: int  # S, padded with zeros; 0: the state is part of the sentence
-    action_width: int  # A, padded with zeros
-    vocabulary: int  # tokens of the sentence
     value_width: int  # values of a token in a layer, of all heads
+
+    def __init__(
+        self,
+        vocabulary: Count,
+        width: Width,
+        layers: Layers,
+        heads: Layers,
+        head_width: Width,
+        feedforward: Width,
+        vision_width: Width,
+        vision_layers: Layers,
+        vision_heads: Layers,
+        vision_feedforward: Width,
+        resolution: Count,
+        patch: Count,
+        expert_width: Width,
+        expert_feedforward: Width,
+        action_width: Width,
+    ) -> None:
+        super().__init__()
+        require_multiple("vision_width", vision_width, "vision_heads", vision_heads)
+        require_multiple("resolution", resolution, "patch", patch)
+        require_multiple("head_width", head_width, "two", 2)
+        require_multiple("expert_width", expert_width, "two", 2)
+        self.vocabulary, self.resolution, self.action_width = vocabulary, resolution, action_width
+        self.width, self.head_width, self.expert_width = width, head_width, expert_width
+        # Sizes under the names that transformers has for them: of all layers, and further ones of each part.
+        self.shared = {"num_attention_heads": heads, "head_dim": head_width, "num_hidden_layers": layers}
+        self.text = {"vocab_size": vocabulary, **sizes(width, feedforward)}
+        self.vision = {"num_hidden_layers": vision_layers, "num_attention_heads": vision_heads, "patch_size": patch}
+        self.vision |= {"image_size": resolution, **sizes(vision_width, vision_feedforward)}
+        self.of_expert = sizes(expert_width, expert_feedforward)
 
     def options(self) -> dict[str, Any]:
         """Return the options by which LeRobot describes this network, as far as they are not its defaults."""

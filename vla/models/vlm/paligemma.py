@@ -16,8 +16,8 @@ import torch
 from torch import Tensor, nn
 from transformers import GemmaConfig, GemmaModel, PaliGemmaConfig, PaliGemmaModel, SiglipVisionConfig
 
-from vla.io.types import Count, Layers, Width
-from vla.models.vlm.network import FlowNetwork, Own, Prefix, require_multiple, shorten, sizes
+from vla.io.types import Inherited
+from vla.models.vlm.network import FlowNetwork, Own, Prefix, shorten
 
 NAMES = (  # of weights, published and here
     ("paligemma_with_expert.paligemma.lm_head.", "paligemma.language_model.embed_tokens."),  # one matrix is both
@@ -37,57 +37,21 @@ HEADS = ("model.", "")  # of published names: what LeRobot saves begins with the
 class PaliGemmaWithExpert(FlowNetwork):
     """What π0 and π0.5 share: the trunk, the expert, and attention between them.
 
-    Args:
-        vocabulary: number of tokens of the sentence.
-        width, layers, heads, head_width, feedforward: of the language model; its heads share one key head.
-        vision_width, vision_layers, vision_heads, vision_feedforward: of the image encoder, a vision transformer.
-        resolution: height and width of an image [px].
-        patch: height and width of a patch, which becomes a token [px].
-        expert_width, expert_feedforward: of the expert, whose layers and heads are those of the language model.
-        action_width: A.
-
-    Raises:
-        UserError: sizes do not divide each other.
+    The heads share one key head, and every patch becomes a token.
     """
 
     published = tuple((f"{head}{there}", here) for head in HEADS for there, here in NAMES)
     pretrained = TRUNK
     unused = tuple(f"{head}paligemma_with_expert.gemma_expert.lm_head." for head in HEADS)
 
-    def __init__(
-        self,
-        vocabulary: Count,
-        width: Width,
-        layers: Layers,
-        heads: Layers,
-        head_width: Width,
-        feedforward: Width,
-        vision_width: Width,
-        vision_layers: Layers,
-        vision_heads: Layers,
-        vision_feedforward: Width,
-        resolution: Count,
-        patch: Count,
-        expert_width: Width,
-        expert_feedforward: Width,
-        action_width: Width,
-    ) -> None:
-        super().__init__()
-        require_multiple("vision_width", vision_width, "vision_heads", vision_heads)
-        require_multiple("resolution", resolution, "patch", patch)
-        require_multiple("head_width", head_width, "two", 2)
-        require_multiple("expert_width", expert_width, "two", 2)
-        self.resolution, self.action_width, self.state_width = resolution, action_width, 0
-        self.value_width, self.vocabulary = head_width, vocabulary
-        shared = {"num_attention_heads": heads, "num_key_value_heads": 1, "head_dim": head_width}
-        shared |= {"num_hidden_layers": layers}
-        text = {**shared, "vocab_size": vocabulary, **sizes(width, feedforward)}
-        vision = {"num_hidden_layers": vision_layers, "num_attention_heads": vision_heads, "patch_size": patch}
-        vision |= {"image_size": resolution, **sizes(vision_width, vision_feedforward)}
-        self.paligemma = _trunk(text, vision)
-        self.expert = _expert({**shared, **sizes(expert_width, expert_feedforward)})
-        self.action_in_proj = nn.Linear(action_width, expert_width)
-        self.action_out_proj = nn.Linear(expert_width, action_width)
+    def __init__(self, **inherited: Inherited) -> None:
+        super().__init__(**inherited)
+        self.state_width, self.value_width = 0, self.head_width
+        shared = {**self.shared, "num_key_value_heads": 1}
+        self.paligemma = _trunk({**shared, **self.text}, self.vision)
+        self.expert = _expert({**shared, **self.of_expert})
+        self.action_in_proj = nn.Linear(self.action_width, self.expert_width)
+        self.action_out_proj = nn.Linear(self.expert_width, self.action_width)
 
     def options(self) -> dict[str, Any]:
         """Return LeRobot's options of this network, whose other sizes it does not let one choose."""

@@ -20,7 +20,7 @@ from torch import Tensor
 from vla.io.errors import UserError
 from vla.io.types import Natural, NonNegative, Shift, Steps, Text
 from vla.models.chunking import after_prefix, require_prefix, with_prefix
-from vla.models.layers import Batch, mean_where
+from vla.models.layers import Batch, mean_where, newest
 from vla.models.model import Model, Prediction
 from vla.models.tokenizers.tokenizer import ActionTokenizer
 from vla.models.vlm.network import FlowNetwork, Prefix
@@ -68,6 +68,7 @@ class VisionLanguageAction(Model):
     uses_tokens = False
     continues = True
 
+    text: Prompt
     noise: Tensor
 
     def __init__(
@@ -126,10 +127,6 @@ class VisionLanguageAction(Model):
             raise UserError(
                 "model.statistics=pretrained takes those of a published policy: add pretrained=…, or leave that out"
             )
-
-    def sample_noise(self, random: torch.Generator) -> Tensor:
-        """Sample standard normal noise, (1, k, A)."""
-        return torch.randn(1, *self.noise.shape, generator=random)
 
     def known(self, batch: Batch) -> Prefix:
         """Encode the newest frame and the sentence."""
@@ -206,8 +203,7 @@ class VisionLanguageAction(Model):
 
 def last_of(known: Prefix) -> Tensor:
     """Return what actions see of the last token of every prefix in the last layer, (B, C): padding may follow it."""
-    places = torch.arange(known.present.shape[1], device=known.present.device)
-    last = (known.present * places).argmax(1)
+    last = newest(known.present)
     return known.values[-1][torch.arange(len(last), device=last.device), :, last].flatten(1)
 
 

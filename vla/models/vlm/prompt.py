@@ -18,7 +18,7 @@ from vla.io.documents import lines_of
 from vla.io.errors import UserError
 from vla.io.types import Steps, Text
 from vla.models.hub import fetch
-from vla.models.text.ngrams import TextEncoder
+from vla.models.text.ngrams import TextEncoder, padding_last
 
 PADDING = -1
 FILE = "tokenizer.json"
@@ -86,9 +86,7 @@ class Prompt(TextEncoder):
         edges = torch.arange(BINS, device=state.device) * (2 / BINS) - 1
         bins = torch.bucketize(state.contiguous(), edges, right=True)  # 0 is below -1
         parts = [tokens, self.numbers[bins].flatten(1), self.end.expand(len(tokens), -1)]
-        joined = torch.cat(parts, 1)
-        order = torch.sort((joined == PADDING).int(), dim=1, stable=True).indices  # what is no padding comes first
-        return joined.gather(1, order)[:, : self.length]
+        return padding_last(torch.cat(parts, 1), PADDING)[:, : self.length]
 
     def _ids(self, text: str, special: bool) -> list[int]:
         if self._tokenizer is None:

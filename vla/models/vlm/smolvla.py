@@ -19,7 +19,7 @@ from transformers import LlamaConfig, LlamaModel, SmolVLMConfig, SmolVLMModel
 from transformers.models.llama.modeling_llama import LlamaAttention, apply_rotary_pos_emb
 
 from vla.io.errors import UserError
-from vla.io.types import Count, Layers, Natural, Width
+from vla.io.types import Count, Inherited, Layers, Natural, Width
 from vla.models.vision.image_tokenizer import ImageEncoder, Keypoints
 from vla.models.vlm.network import FlowNetwork, Own, Prefix, Rotation, require_multiple, shorten, sizes, with_time
 
@@ -36,19 +36,13 @@ class SmolVLA(FlowNetwork):
     the prefix, images and sentence see each other, and the state, which comes last, sees all.
 
     Args:
-        vocabulary: number of tokens of the sentence.
-        width, layers, heads, key_heads, head_width, feedforward: of the language model; several heads share a key head.
-        vision_width, vision_layers, vision_heads, vision_feedforward: of the image encoder, a vision transformer.
-        resolution: height and width of an image [px].
-        patch: height and width of a patch [px].
+        key_heads: of the language model, each of which several heads share.
         shuffle: so many by so many neighbouring patches become one token.
         image: factory of an image encoder, conditioned on the sum of the words, for `keypoints`.
         keypoints: tokens per image that take the place of the vision transformer's: from random weights that needs many
             more images until it knows where things are; 0: none, as in published weights.
-        expert_width, expert_feedforward: of the expert, whose heads are those of the language model.
         joint_every: 1: no layer attends to the prefix alone.
         state_width: S.
-        action_width: A.
 
     Raises:
         UserError: sizes do not divide each other, or keypoints have no image encoder.
@@ -65,56 +59,33 @@ class SmolVLA(FlowNetwork):
 
     def __init__(
         self,
-        vocabulary: Count,
-        width: Width,
-        layers: Layers,
-        heads: Layers,
         key_heads: Layers,
-        head_width: Width,
-        feedforward: Width,
-        vision_width: Width,
-        vision_layers: Layers,
-        vision_heads: Layers,
-        vision_feedforward: Width,
-        resolution: Count,
-        patch: Count,
         shuffle: Count,
         image: Callable[..., ImageEncoder] | None,
         keypoints: Natural,
-        expert_width: Width,
-        expert_feedforward: Width,
         joint_every: Layers,
         state_width: Width,
-        action_width: Width,
+        **inherited: Inherited,
     ) -> None:
-        super().__init__()
-        require_multiple("heads", heads, "key_heads", key_heads)
-        require_multiple("vision_width", vision_width, "vision_heads", vision_heads)
-        require_multiple("resolution", resolution, "patch times shuffle", patch * shuffle)
-        require_multiple("head_width", head_width, "two", 2)
-        require_multiple("expert_width", expert_width, "two", 2)
-        self.resolution, self.state_width, self.action_width = resolution, state_width, action_width
-        self.vocabulary = vocabulary
-        self.head_width, self.joint_every, self.value_width = head_width, joint_every, key_heads * head_width
-        attention = {"num_attention_heads": heads, "num_key_value_heads": key_heads, "head_dim": head_width}
-        shared = {**attention, "num_hidden_layers": layers, "rms_norm_eps": EPSILON, **NO_TOKENS}
-        text = {**shared, "vocab_size": vocabulary, **sizes(width, feedforward)}
-        vision = {"num_hidden_layers": vision_layers, "num_attention_heads": vision_heads, "patch_size": patch}
-        vision |= {"image_size": resolution, **sizes(vision_width, vision_feedforward)}
-        self.vlm = _trunk(text, vision, shuffle)
+        super().__init__(**inherited)
+        require_multiple("heads", self.shared["num_attention_heads"], "key_heads", key_heads)
+        require_multiple("resolution", self.resolution, "patch times shuffle", self.vision["patch_size"] * shuffle)
+        self.state_width, self.joint_every, self.value_width = state_width, joint_every, key_heads * self.head_width
+        shared = {**self.shared, "num_key_value_heads": key_heads, "rms_norm_eps": EPSILON, **NO_TOKENS}
+        self.vlm = _trunk({**shared, **self.text}, self.vision, shuffle)
         self.keypoints: KeypointTokens | None = None
         if keypoints:
             if image is None:
                 raise UserError(f"model.network.keypoints={keypoints} need an image encoder, model.network.image")
-            self.keypoints = KeypointTokens(image, keypoints, width)
-            nn.init.normal_(self.vlm.text_model.embed_tokens.weight, std=width**-0.5)  # words as large as keypoints
+            self.keypoints = KeypointTokens(image, keypoints, self.width)
+            nn.init.normal_(self.vlm.text_model.embed_tokens.weight, std=self.width**-0.5)  # as large as keypoints
             del self.vlm.vision_model, self.vlm.connector
-        self.expert = _expert(shared, joint_every, expert_width, expert_feedforward)
-        self.state_proj = nn.Linear(state_width, width)
-        self.action_in_proj = nn.Linear(action_width, expert_width)
-        self.action_out_proj = nn.Linear(expert_width, action_width)
-        self.action_time_mlp_in = nn.Linear(2 * expert_width, expert_width)
-        self.action_time_mlp_out = nn.Linear(expert_width, expert_width)
+        self.expert = _expert(shared, joint_every, **self.of_expert)
+        self.state_proj = nn.Linear(state_width, self.width)
+        self.action_in_proj = nn.Linear(self.action_width, self.expert_width)
+        self.action_out_proj = nn.Linear(self.expert_width, self.action_width)
+        self.action_time_mlp_in = nn.Linear(2 * self.expert_width, self.expert_width)
+        self.action_time_mlp_out = nn.Linear(self.expert_width, self.expert_width)
 
     def options(self) -> dict[str, Any]:
         """Return LeRobot's options of this network; the width of the expert is a factor of that of the trunk.
@@ -242,11 +213,11 @@ def _trunk(text: dict[str, Any], vision: dict[str, Any], shuffle: int) -> SmolVL
     return trunk
 
 
-def _expert(shared: dict[str, Any], joint_every: int, width: int, feedforward: int) -> LlamaModel:
+def _expert(shared: dict[str, Any], joint_every: int, hidden_size: int, intermediate_size: int) -> LlamaModel:
     """Build the expert, whose input is no text."""
     # Heads need not fill its width, which the check of its configuration demands.
-    config = LlamaConfig(**shared, vocab_size=1, **sizes(shared["num_attention_heads"], feedforward))
-    config.hidden_size = width
+    config = LlamaConfig(**shared, vocab_size=1, **sizes(shared["num_attention_heads"], intermediate_size))
+    config.hidden_size = hidden_size
     expert = LlamaModel(config)
     del expert.embed_tokens
     for number, layer in enumerate(expert.layers):

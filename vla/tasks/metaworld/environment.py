@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le, Predicate
 
-from vla.io.errors import UserError
-from vla.io.suggestion import suggestion
+from vla.io.errors import UserError, suggestion
 from vla.io.types import ImageSize, Names, Natural, Share, Text
 from vla.spec import Array, Observation, Spec
 from vla.tasks.metaworld.package import tasks_of

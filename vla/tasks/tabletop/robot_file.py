@@ -21,8 +21,7 @@ from urllib.parse import unquote, urlsplit
 import mujoco
 from annotated_types import MinLen
 
-from vla.io.errors import UserError
-from vla.io.suggestion import suggestion
+from vla.io.errors import UserError, suggestion
 from vla.io.types import Inherited, Names, Point, Positive, Text
 
 log = logging.getLogger(__name__)
