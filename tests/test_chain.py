@@ -80,12 +80,12 @@ def test_every_instruction_is_possible_where_those_before_leave_the_blocks() -> 
         for goal, referents in links:
             seen.add(type(goal))
             block = referents.blocks[0]
-            assert block not in now.on_blocks.values()  # nothing stands on it
+            assert ("block", block) not in now.spots.values()  # nothing stands on it
             assert now.held in (None, block)  # what is in the hand is put down first
             if isinstance(goal, Stack):
-                assert referents.blocks[1] not in now.on_blocks
+                assert not now.stacked(referents.blocks[1])
             elif not isinstance(goal, Lift):
-                assert referents.pads[0] not in now.on_pads.values()
+                assert ("pad", referents.pads[0]) not in now.spots.values()
             after = goal.after(now, referents)
             assert after is not None
             now = after

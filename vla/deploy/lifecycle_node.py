@@ -8,6 +8,7 @@ from __future__ import annotations
 import traceback
 from abc import abstractmethod
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import wraps
 from typing import Any
 
@@ -41,7 +42,7 @@ class GuardedLifecycleNode(LifecycleNode):
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
-        self._created: list[Callable[[], Any]] = []  # functions that destroy what was created
+        self.created = ExitStack()  # destroys what is added when it is closed, after which more can be added
 
     @property
     @abstractmethod
@@ -55,33 +56,27 @@ class GuardedLifecycleNode(LifecycleNode):
     def add_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
         """Subscribe to a topic."""
         subscription = self.create_subscription(kind, topic, self.guard(callback), qos)
-        self._created.append(lambda: self.destroy_subscription(subscription))
+        self.created.callback(self.destroy_subscription, subscription)
 
     def add_publisher(self, kind: type, topic: str, while_active: bool = False) -> Any:
         """Create a publisher that publishes always or only `while_active`."""
         if while_active:
             publisher: Any = self.create_lifecycle_publisher(kind, topic, 1)
-            self._created.append(lambda: self.destroy_lifecycle_publisher(publisher))
+            self.created.callback(self.destroy_lifecycle_publisher, publisher)
         else:
             publisher = super(LifecycleNode, self).create_publisher(kind, topic, 10)
-            self._created.append(lambda: self.destroy_publisher(publisher))
+            self.created.callback(self.destroy_publisher, publisher)
         return publisher
 
     def add_service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
         """Create a service."""
-        service = self.create_service(kind, name, callback)
-        self._created.append(lambda: self.destroy_service(service))
+        self.created.callback(self.destroy_service, self.create_service(kind, name, callback))
 
     def add_action_client(self, kind: Any, name: str) -> ActionClient:
         """Create the client of an action."""
         client = ActionClient(self, kind, name)
-        self._created.append(client.destroy)
+        self.created.callback(client.destroy)
         return client
-
-    def destroy_created(self) -> None:
-        """Destroy what was added."""
-        while self._created:
-            self._created.pop()()
 
     def guard(self, callback: Callable[..., None]) -> Callable[..., None]:
         """Wrap a callback: an exception stops the arm, not the process."""

@@ -109,7 +109,7 @@ class PolicyNode(GuardedLifecycleNode):
         if self.loop is not None:
             self._inference.close()
         self.loop = None
-        self.destroy_created()
+        self.created.close()
 
     def brake(self) -> None:
         """Publish commands until the arm is at rest, then stop the timers; does nothing if the node is inactive."""

@@ -5,45 +5,15 @@ ROS is imported only in `run`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
-from vla.deploy.ros import RosNetwork, ros, spin
+from vla.deploy.ros import ros, spin
 from vla.deploy.settings import FOLLOW, PolicySettings, SimulatorSettings, action_class
 from vla.io.errors import UserError
 
-if TYPE_CHECKING:
-    from vla.policy import Policy
-    from vla.spec import Environment
 
-
-@dataclass(kw_only=True)
-class _RosDeployment:
-    """What both deployments need.
-
-    Attributes:
-        network: where to communicate.
-        policy, environment: factories of the checkpoint's policy and of its task's environment.
-        output: folder of the ROS logs.
-    """
-
-    network: RosNetwork
-    policy: Callable[[], Policy]
-    environment: Callable[[], Environment]
-    output: Path
-
-
-@dataclass(kw_only=True)
-class PolicyDeployment(PolicySettings, _RosDeployment):
-    """The policy as a managed node.
-
-    Attributes:
-        autostart: configure and activate at start; otherwise leave that to a lifecycle manager.
-    """
-
-    autostart: bool
+class PolicyDeployment(PolicySettings):
+    """The policy as a managed node."""
 
     def run(self) -> None:
         """Run until interrupted, then brake and hold; raise a UserError if policy, robot and messages do not fit."""
@@ -67,8 +37,7 @@ class PolicyDeployment(PolicySettings, _RosDeployment):
                 agent.destroy_node()
 
 
-@dataclass(kw_only=True)
-class SimulatorDeployment(SimulatorSettings, _RosDeployment):
+class SimulatorDeployment(SimulatorSettings):
     """The simulated arm of a task as a node with the topics of a real one."""
 
     needs_policy: ClassVar[bool] = False

@@ -6,12 +6,18 @@ import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib import import_module
-from typing import Any, Literal, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from vla.deploy.joint_limiter import JointLimits
+from vla.deploy.ros import RosNetwork
 from vla.deploy.safety import Safety
 from vla.io.errors import UserError
 from vla.io.types import NonNegative, Positive, Seed
+
+if TYPE_CHECKING:
+    from vla.policy import Policy
+    from vla.spec import Environment
 
 COMPRESSED = "/compressed"  # end of the topics of sensor_msgs/CompressedImage, as of image_transport
 NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)  # of a topic
@@ -104,44 +110,58 @@ def action_class(package: str, name: str) -> Any:
 
 
 @dataclass(kw_only=True)
-class PolicySettings:
-    """Settings of the policy node.
+class NodeSettings:
+    """What both nodes need.
 
     Attributes:
         robot: the joints of the arm and their limits.
         topics: names of the topics.
+        network: where to communicate.
+        policy, environment: factories of the checkpoint's policy and of its task's environment.
+        output: folder of the ROS logs.
+    """
+
+    robot: JointLimits
+    topics: Topics
+    network: RosNetwork
+    policy: Callable[[], Policy]
+    environment: Callable[[], Environment]
+    output: Path
+
+
+@dataclass(kw_only=True)
+class PolicySettings(NodeSettings):
+    """Settings of the policy node.
+
+    Attributes:
         command: JointState with positions, JointTrajectory that ends at rest, Float64MultiArray of positions, or goals
             of the action FollowJointTrajectory.
         gripper: action of the gripper; None: it takes positions on a topic.
         command_hz: commands per second.
         dry_run: publish the commands below ~/dry_run, where nothing obeys them.
         safety: time-outs and limits.
+        autostart: configure and activate at start; otherwise leave that to a lifecycle manager.
     """
 
-    robot: JointLimits
-    topics: Topics
     command: Literal["joint_state", "trajectory", "forward", "follow_joint_trajectory"]
     gripper: GripperCommand | FrankaGripper | None
     command_hz: Positive
     dry_run: bool
     safety: Safety
+    autostart: bool
 
 
 @dataclass(kw_only=True)
-class SimulatorSettings:
+class SimulatorSettings(NodeSettings):
     """Settings of the simulator node.
 
     Attributes:
-        robot: names of the joints of the arm.
-        topics: names of the topics.
         joints_hz: rate of joint states and of the execution of commands.
         camera_hz: rate of images.
         command_timeout: the arm holds after so long without a command [s].
         seed: seed of the first episode.
     """
 
-    robot: JointLimits
-    topics: Topics
     joints_hz: Positive
     camera_hz: Positive
     command_timeout: Positive

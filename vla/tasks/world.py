@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, TypeVar
 from zlib import crc32
 
 import numpy as np
@@ -13,6 +13,7 @@ from vla.io.errors import UserError
 from vla.parallel.limits import scarce_memory
 
 FREE = 0.25  # share of the memory that scenes leave free
+Scene = TypeVar("Scene")
 
 
 class World:
@@ -42,34 +43,34 @@ class World:
             self._blind = before
 
 
-class _Closable(Protocol):
-    def close(self) -> None: ...
+class ManyTasks(World):
+    """Base class of worlds with several `tasks`, which seeds take in turn, in scenes that are made when first played.
 
-
-Scene = TypeVar("Scene", bound=_Closable)
-
-
-class Scenes(Generic[Scene]):
-    """The scenes of a world's tasks, made when first played; where memory is scarce, a new one replaces the newest.
-
-    Tasks take turns, so the oldest ones are needed first.
+    Where memory is scarce, a new scene replaces the newest: the oldest ones are needed first.
     """
 
-    def __init__(self) -> None:
-        self._made: dict[str, Scene] = {}
+    tasks: tuple[str, ...]
 
-    def of(self, name: str, make: Callable[[], Scene]) -> Scene:
+    def __init__(self) -> None:
+        super().__init__()
+        self._scenes: dict[str, Any] = {}
+
+    def task_of(self, seed: int) -> str:
+        """Return the task of the episode of `seed`."""
+        return self.tasks[seed % len(self.tasks)]
+
+    def _scene_of(self, name: str, make: Callable[[], Scene]) -> Scene:
         """Return the scene called `name`, which `make` makes if there is none."""
-        if name not in self._made:
-            if self._made and scarce_memory(FREE):
-                self._made.popitem()[1].close()
-            self._made[name] = make()
-        return self._made[name]
+        if name not in self._scenes:
+            if self._scenes and scarce_memory(FREE):
+                self._scenes.popitem()[1].close()
+            self._scenes[name] = make()
+        return self._scenes[name]
 
     def close(self) -> None:
-        """Free physics and GL of all."""
-        while self._made:
-            self._made.popitem()[1].close()
+        """Free physics and GL of all scenes."""
+        while self._scenes:
+            self._scenes.popitem()[1].close()
 
 
 class Streams:

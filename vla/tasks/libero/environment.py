@@ -18,7 +18,7 @@ from vla.tasks.libero.package import ALL, Task, suites_of, tasks_of
 from vla.tasks.libero.scene import BURNER, VISIBLE, Detail, load_scene
 from vla.tasks.libero.starts import Randomize, Starts, set_start
 from vla.tasks.rendering.renderer import LazyRenderer, RendererFactory, Views
-from vla.tasks.world import Scenes, World
+from vla.tasks.world import ManyTasks
 
 CONTROL_HZ = 20.0
 STATE = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z", "finger_1", "finger_2")
@@ -35,7 +35,7 @@ TINT = 0.2, 1.0  # range of the factors of red, green and blue
 Numbers = Annotated[list[Annotated[int, Ge(0), Le(9)]], MinLen(1), Predicate(unique)]
 
 
-class Libero(World):
+class Libero(ManyTasks):
     """Tasks of a Panda on a table, a floor or in a kitchen, one of them per episode: seeds take them in turn.
 
     Success is the first step that LIBERO calls one; an episode ends with it, or when its steps are used up. The state
@@ -99,23 +99,18 @@ class Libero(World):
             control_hz=CONTROL_HZ,
             truth=(("object", 3), ("goal", 3)),
         )
-        self._scenes = Scenes[Scene]()
 
     @property
     def tool(self) -> Array:
         """(3,) position of the grip in the world [m]."""
         return self._scene.data.site_xpos[self._scene.controller.site].copy()
 
-    def task_of(self, seed: int) -> str:
-        """Return the task of the episode of `seed`."""
-        return self.tasks[seed % len(self.tasks)]
-
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`."""
         number = seed % len(self._tasks)
         task = self._task = self._tasks[number]
         self.task, self.done, self.outcome, self._taken = task.name, False, "timeout", 0
-        scene = self._scene = self._scenes.of(task.scene, lambda: Scene(task, self._renderer, self.spec, self._detail))
+        scene = self._scene = self._scene_of(task.scene, lambda: Scene(task, self._renderer, self.spec, self._detail))
         starts, self._goal = scene.started(task)
         turn = (seed - FIRST_SEED) // len(self._tasks)
         fixed = self._starts_of == "official" or (self._starts_of == "by_seed" and seed >= FIRST_SEED)
@@ -144,10 +139,6 @@ class Libero(World):
             self.outcome = "success"
         self.done = self.outcome == "success" or self._taken == self._limits[self._task.suite.partition("_")[0]]
         return self._look()
-
-    def close(self) -> None:
-        """Free physics and GL."""
-        self._scenes.close()
 
     def _look(self) -> Observation:
         scene = self._scene

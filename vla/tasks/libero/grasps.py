@@ -44,7 +44,7 @@ def choose_grasp(at: Situation, thing: str, place: Place) -> Grasp | None:
     for least, kind in zip(KINDS, kinds, strict=False):
         if best is not None and best[1] < least:
             break  # what is in its way costs less than another kind
-        found = [(width, grasp) for width, grasp in kind if fits(grasp, points)]
+        found = [(width, grasp) for width, grasp in kind if gap_of(grasp, points) > 0]
         if not found:
             continue
         moves, hindrances = _costs(at, thing, [one for _, one in found], place)
@@ -150,11 +150,6 @@ def parts(pieces: Sequence[Array], alone: bool = True) -> Iterator[tuple[float, 
             aside = np.abs((band[:, :2] - middle) @ closing)
             if width < WIDEST / 2 and not (alone and aside[aside < OPEN].max(initial=0.0) > width / 2 + THIN):
                 yield width, Grasp(np.array([*middle, height]), float(yaw))
-
-
-def fits(grasp: Grasp, points: Array) -> bool:
-    """Return whether the open fingers do not come down on the thing itself."""
-    return gap_of(grasp, points) > 0
 
 
 def gap_of(grasp: Grasp, points: Array) -> float:

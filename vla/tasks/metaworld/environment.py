@@ -15,7 +15,7 @@ from vla.spec import Array, Observation, Spec
 from vla.tasks.metaworld.package import tasks_of
 from vla.tasks.metaworld.scene import TaskScene, parts_of
 from vla.tasks.rendering.renderer import RendererFactory
-from vla.tasks.world import Scenes, World
+from vla.tasks.world import ManyTasks
 
 CONTROL_HZ = 80.0  # five substeps of 2.5 ms
 REACH = 0.01  # largest displacement of the hand per step, along each axis [m]
@@ -34,7 +34,7 @@ def within(window: Sequence[float]) -> bool:
 Window = Annotated[tuple[Share, Share, Share, Share], Predicate(within)]
 
 
-class MetaWorld(World):
+class MetaWorld(ManyTasks):
     """Fifty tasks of a Sawyer arm, one of them per episode: the seed determines which, in turn.
 
     Success is the first step that Meta-World calls one; an episode ends with it, or when its steps are used up. The
@@ -101,17 +101,12 @@ class MetaWorld(World):
         )
         self._sentences, self._steps = sentences, steps
         self._make_scene = partial(TaskScene, spec=self.spec, renderer=renderer, drawn=drawn, shadows=shadows)
-        self._scenes = Scenes[TaskScene]()
         self.tool: Array = np.zeros(3)
-
-    def task_of(self, seed: int) -> str:
-        """Return the task of the episode of `seed`."""
-        return self.tasks[seed % len(self.tasks)]
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`."""
         self.task, self.done, self.outcome, self._taken = self.task_of(seed), False, "timeout", 0
-        self._scene = self._scenes.of(self.task, partial(self._make_scene, self.task))
+        self._scene = self._scene_of(self.task, partial(self._make_scene, self.task))
         observation = self._scene.reset(seed)
         places = {"object": observation[OBJECT], "goal": observation[GOAL]}
         self.draws = {name: {"place": place[:2].tolist(), "height": float(place[2])} for name, place in places.items()}
@@ -125,10 +120,6 @@ class MetaWorld(World):
         self._taken += 1
         self.done = solved or self._taken == self._steps
         return self._look(observation)
-
-    def close(self) -> None:
-        """Free physics and GL."""
-        self._scenes.close()
 
     def _look(self, observation: Array) -> Observation:
         pictures = () if self._blind else self._scene.pictures()

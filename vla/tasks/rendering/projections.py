@@ -59,19 +59,12 @@ def shadow_projection(model: mujoco.MjModel, data: mujoco.MjData, light: int) ->
         half = near * np.tan(np.radians(angle / 2))
         projection = frustum(-half, half, -half, half, near, far)
     forward = data.light_xdir[light]
-    up = _cross(forward, np.array([-1.0, 0.0, 0.0]))
+    up = np.cross(forward, [-1.0, 0.0, 0.0])
     if up @ up <= 0.01:
-        up = _cross(forward, np.array([0.0, 1.0, 0.0]))
+        up = np.cross(forward, [0.0, 1.0, 0.0])
     up /= np.linalg.norm(up)
-    axes = np.stack([_cross(forward, up), up, -forward])
+    axes = np.stack([np.cross(forward, up), up, -forward])
     return projection @ inverse_pose(data.light_xpos[light], axes)
-
-
-def _cross(one: Array, other: Array) -> Array:
-    """Return the cross product (3,), a tenth of the time of numpy's."""
-    product = np.empty(3)
-    mujoco.mju_cross(product, one, other)
-    return product
 
 
 class ModelCameras:

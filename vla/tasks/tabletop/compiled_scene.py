@@ -9,19 +9,11 @@ import mujoco
 import numpy as np
 
 from vla.io.errors import UserError
-from vla.spec import Array, Shape
-from vla.tasks.rendering.shapes import mesh_triangles
-from vla.tasks.tabletop.robot import VISIBLE, TabletopRobot
+from vla.spec import Array
+from vla.tasks.tabletop.robot import TabletopRobot
 from vla.tasks.tabletop.scene import BLOCK_DENSITY, BLOCK_HALF_SIZE, COLOURS, PAD_THICKNESS, PADS, compile_scene
 
 AWAY = (-1.5, 0.0, -3.0)  # position of blocks and pads that are absent [m]
-SHAPES: dict[mujoco.mjtGeom, Literal["mesh", "box", "cylinder", "sphere", "capsule"]] = {
-    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
-    mujoco.mjtGeom.mjGEOM_BOX: "box",
-    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
-    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
-    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
-}
 
 
 @dataclass(frozen=True)
@@ -182,20 +174,12 @@ class CompiledScene:
         self.data.qpos[self.joints] = joints
         self.data.qpos[self.fingers], self.grip = self.robot.grip(opening)
 
-    def opening(self) -> float:
-        """Return the measured distance between the fingertips [m]."""
-        return self.robot.opening(self.model, self.data)
-
     def controls(self, commands: Array) -> Array:
         """Return the actuators' controls (N, nu) for commands (N, J + 1): joint targets [rad], gripper command."""
         robot, controls = self.robot, np.empty((len(commands), self.model.nu))
         controls[:, self.arm_actuators] = commands[:, :-1]
         controls[:, self._grips] = robot.closed + commands[:, -1:] * ((robot.opened - robot.closed) / robot.travel)
         return controls
-
-    def turn_camera(self, camera: int, rotation: Array) -> None:
-        """Turn camera `camera` by the rotation vector `rotation` (3,) [rad] in its own frame."""
-        mujoco.mju_quatIntegrate(self.model.cam_quat[camera], rotation, 1.0)
 
     def place_block(self, index: int, x: float, y: float, yaw: float) -> None:
         """Put block `index` on the table at (x, y) [m], turned by `yaw` [rad]."""
@@ -221,24 +205,3 @@ class CompiledScene:
                 if tip in self._side and other in block_of:
                     pairs.add((self._side[tip], block_of[other]))
         return pairs
-
-    def shapes(self) -> list[Shape]:
-        """Return the visible shapes."""
-        model, shapes = self.model, []
-        for geom in np.flatnonzero(model.geom_group == VISIBLE):
-            kind = SHAPES.get(mujoco.mjtGeom(model.geom_type[geom]))
-            if kind is None:
-                continue
-            vertices = faces = None
-            if kind == "mesh":
-                vertices, faces = (values.copy() for values in mesh_triangles(model, int(model.geom_dataid[geom])))
-            name = model.geom(geom).name or f"geom{geom}"
-            body = model.body(model.geom_bodyid[geom]).name
-            place = (model.geom_pos[geom].copy(), model.geom_quat[geom].copy(), model.geom_size[geom].copy())
-            shapes.append(Shape(body, name, kind, *place, model.geom_rgba[geom].copy(), vertices, faces))
-        return shapes
-
-    def poses(self) -> dict[str, Array]:
-        """Return body name → (7,) position [m] and quaternion wxyz in the world frame."""
-        pose = np.concatenate([self.data.xpos, self.data.xquat], axis=1)
-        return {self.model.body(body).name: pose[body] for body in range(self.model.nbody)}

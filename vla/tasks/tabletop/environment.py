@@ -16,6 +16,7 @@ from vla.io.types import Count, ImageSize, Names, Point, Positive
 from vla.spec import FIRST_SEED, Array, Observation, Shape, Spec
 from vla.tasks.gl import require_backend
 from vla.tasks.rendering.renderer import LazyRenderer, RendererFactory, Views
+from vla.tasks.rendering.shapes import mesh_triangles
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.expert import Waypoint
 from vla.tasks.tabletop.file_robot import FileRobot
@@ -32,6 +33,7 @@ from vla.tasks.world import World
 TRANSLATION = 0.04  # largest translation per step [m]
 ROTATION = 0.25  # largest rotation per step [rad]
 MILLIMETRES = 1000.0  # of a metre
+SHAPES = ("mesh", "box", "cylinder", "sphere", "capsule")  # kinds of geoms that `shapes` returns
 QUANTILES = np.array([NormalDist().inv_cdf((index + 0.5) / 256) for index in range(256)])  # of the normal distribution
 
 
@@ -164,7 +166,8 @@ class Tabletop(World):
     @property
     def events(self) -> list[tuple[int, str]]:
         """Control step and description of every disturbance so far in this episode."""
-        return self.simulation.events
+        disturber = self.simulation.disturber
+        return disturber.events if disturber else []
 
     @property
     def tool(self) -> Array:
@@ -176,7 +179,7 @@ class Tabletop(World):
         """Measure (2 J + 1,) float32: joint positions [rad], their velocities [rad/s] and the gripper's opening [m]."""
         compiled, noise = self.simulation.compiled, self.simulation.compiled.noise
         joints, velocities = compiled.data.qpos[compiled.joints], compiled.data.qvel[compiled.velocities]
-        opening = compiled.opening()
+        opening = compiled.robot.opening(compiled.model, compiled.data)
         if noise.joints or noise.gripper:
             joints = joints + noise.joints * self._joint_noise.randn(len(joints))
             opening = max(0.0, opening + noise.gripper * float(self._joint_noise.randn()))
@@ -184,11 +187,25 @@ class Tabletop(World):
 
     def shapes(self) -> list[Shape]:
         """Return the visible shapes of the current episode."""
-        return self.simulation.compiled.shapes()
+        model, shapes = self.simulation.compiled.model, []
+        for geom in np.flatnonzero(model.geom_group == VISIBLE):
+            kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+            if kind not in SHAPES:
+                continue
+            vertices = faces = None
+            if kind == "mesh":
+                vertices, faces = (values.copy() for values in mesh_triangles(model, int(model.geom_dataid[geom])))
+            name = model.geom(geom).name or f"geom{geom}"
+            body = model.body(model.geom_bodyid[geom]).name
+            place = (model.geom_pos[geom].copy(), model.geom_quat[geom].copy(), model.geom_size[geom].copy())
+            shapes.append(Shape(body, name, kind, *place, model.geom_rgba[geom].copy(), vertices, faces))
+        return shapes
 
     def poses(self) -> dict[str, Array]:
         """Return body name → (7,) position [m] and quaternion wxyz in the world frame."""
-        return self.simulation.compiled.poses()
+        model, data = self.simulation.compiled.model, self.simulation.compiled.data
+        pose = np.concatenate([data.xpos, data.xquat], axis=1)
+        return {model.body(body).name: pose[body] for body in range(model.nbody)}
 
     def minimal_step(self) -> dict[str, Callable[[], object]]:
         """Return name → minimal work of a control step from the present state, as calls for the benchmark to time."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
+from dataclasses import dataclass
 from string import Formatter
 from typing import Annotated, Literal
 
@@ -18,46 +19,32 @@ Words = Annotated[Sequence[Annotated[str, MinLen(1), MaxLen(60)]], MinLen(1)]
 HeldOut = Literal["words", "phrasings", "combinations"]
 
 
+@dataclass(eq=False)
 class Grammar:
     """Phrasings with slots: the goal fills {block}, a random synonym fills {put}.
 
-    Held out from training: some synonyms, some phrasings, and some colours of the named block.
+    Held out from training, for evaluation only: some synonyms, some phrasings, and some colours of the named block
+    (UserError: a held-out part is empty, replaces nothing or overlaps with training, or a slot is malformed).
     """
 
-    def __init__(
-        self,
-        phrasings: Phrasings,
-        words: Mapping[str, Words],
-        held_out_phrasings: Phrasings,
-        held_out_words: Mapping[str, Words],
-        held_out_colours: Sequence[str],
-    ) -> None:
-        """Take what training says, and what is held out from it.
+    phrasings: Phrasings
+    words: Mapping[str, Words]  # slot → synonyms
+    held_out_phrasings: Phrasings
+    held_out_words: Mapping[str, Words]  # slot → synonyms
+    held_out_colours: Sequence[str]
 
-        Args:
-            phrasings: training phrasings.
-            words: slot → training synonyms.
-            held_out_phrasings: phrasings for evaluation only.
-            held_out_words: slot → synonyms for evaluation only.
-            held_out_colours: block colours that training instructions never name.
-
-        Raises:
-            UserError: a held-out part is empty, replaces nothing or overlaps with training, or a phrasing has a
-                malformed slot.
-        """
-        self.phrasings, self.words = tuple(phrasings), {slot: tuple(choices) for slot, choices in words.items()}
-        self.held_out_phrasings = tuple(held_out_phrasings)
-        self.held_out_words = {slot: tuple(choices) for slot, choices in held_out_words.items()}
-        self.held_out_colours = tuple(held_out_colours)
-        leaked = set(phrasings) & set(held_out_phrasings)
-        leaked |= {word for slot, new in held_out_words.items() for word in new if word in words.get(slot, ())}
+    def __post_init__(self) -> None:
+        words, held_out = self.words, self.held_out_words
+        leaked = {*self.phrasings} & {*self.held_out_phrasings}
+        leaked |= {word for slot, new in held_out.items() for word in new if word in words.get(slot, ())}
         if leaked:
             raise UserError(f"task.goal.language holds out what training also uses: {sorted(leaked)}")
-        if not held_out_phrasings or not held_out_words:
+        if not self.held_out_phrasings or not held_out:
             raise UserError("the held-out part of task.goal.language is empty")
-        if not any(f"{{{slot}}}" in phrasing for phrasing in phrasings for slot in held_out_words):
+        if not any(f"{{{slot}}}" in phrasing for phrasing in self.phrasings for slot in held_out):
             raise UserError("task.goal.language.held_out_words has no slot of the phrasings, so it replaces no word")
-        self.slots = {slot for phrasing in (*phrasings, *held_out_phrasings) for slot in _slots(phrasing)} - {*words}
+        every = (*self.phrasings, *self.held_out_phrasings)
+        self.slots = {slot for phrasing in every for slot in _slots(phrasing)} - {*words}
 
     def renamed(self, slots: Mapping[str, str]) -> Grammar:
         """Return the grammar with other names for some slots, old → new, which are replaced in that order."""

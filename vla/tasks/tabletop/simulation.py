@@ -330,11 +330,6 @@ class Simulation:
         }
 
     @property
-    def events(self) -> list[tuple[int, str]]:
-        """Control step and description of every disturbance so far."""
-        return self.disturber.events if self.disturber else []
-
-    @property
     def over(self) -> bool:
         """True if the goal was reached and held, or its time is up."""
         return self.classifier.success or self._periods >= self._most_periods

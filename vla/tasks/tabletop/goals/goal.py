@@ -22,6 +22,7 @@ SLOTS = frozenset({"block", "other", "pad", "rest", "absent"})  # of instruction
 
 Skill = Literal["place", "hold", "push", "stay"]
 SKILLS: tuple[Skill, ...] = ("place", "hold", "push", "stay")
+Spot = tuple[Literal["pad", "block"], int]  # where a block can be put, by the index of the pad or of the block below
 
 
 @dataclass(frozen=True)
@@ -65,33 +66,26 @@ class Referents:
 class Arrangement:
     """Places of the blocks after instructions were carried out; a block without a place lies free on the table."""
 
-    on_pads: Mapping[int, int] = field(default_factory=dict)  # block → pad
-    on_blocks: Mapping[int, int] = field(default_factory=dict)  # block → block below
+    spots: Mapping[int, Spot] = field(default_factory=dict)  # block → where it is
     held: int | None = None  # block in the gripper
+
+    def stacked(self, block: int) -> bool:
+        """Return whether a block stands on another one."""
+        return block in self.spots and self.spots[block][0] == "block"
 
     def allows(self, block: int) -> bool:
         """Return whether the gripper can take a block, or has it: it holds no other, and none stands on it."""
-        return self.held in (None, block) and block not in self.on_blocks.values()
+        return self.held in (None, block) and ("block", block) not in self.spots.values()
 
     def lifted(self, block: int) -> Arrangement:
         """Return the arrangement with a block in the gripper."""
-        return Arrangement(_without(self.on_pads, block), _without(self.on_blocks, block), block)
+        return Arrangement({other: spot for other, spot in self.spots.items() if other != block}, block)
 
-    def on_pad(self, block: int, pad: int) -> Arrangement | None:
-        """Return the arrangement with a block moved to a pad, and let go; None if that is not free."""
-        if pad in self.on_pads.values():
+    def put(self, block: int, spot: Spot) -> Arrangement | None:
+        """Return the arrangement with a block moved to a spot, and let go; None if that is not free, or on a tower."""
+        if spot in self.spots.values() or (spot[0] == "block" and self.stacked(spot[1])):
             return None
-        return Arrangement({**self.on_pads, block: pad}, _without(self.on_blocks, block))
-
-    def on_block(self, block: int, below: int) -> Arrangement | None:
-        """Return the arrangement with a block put on another, and let go; None if that one is not free."""
-        if below in self.on_blocks or below in self.on_blocks.values():
-            return None
-        return Arrangement(_without(self.on_pads, block), {**self.on_blocks, block: below})
-
-
-def _without(places: Mapping[int, int], block: int) -> dict[int, int]:
-    return {other: place for other, place in places.items() if other != block}
+        return Arrangement({**self.spots, block: spot})
 
 
 @dataclass(frozen=True)

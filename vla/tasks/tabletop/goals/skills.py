@@ -77,7 +77,7 @@ class Place(PickPlace):
     def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
         """See `Goal`."""
         (block,), (pad, _) = referents.blocks, referents.pads
-        return arrangement.on_pad(block, pad) if arrangement.allows(block) else None
+        return arrangement.put(block, ("pad", pad)) if arrangement.allows(block) else None
 
 
 class Push(Goal):
@@ -101,8 +101,8 @@ class Push(Goal):
     def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
         """See `Goal`: the block must stand on the table, and the gripper be empty."""
         (block,), (pad, _) = referents.blocks, referents.pads
-        possible = arrangement.held is None and arrangement.allows(block) and block not in arrangement.on_blocks
-        return arrangement.on_pad(block, pad) if possible else None
+        possible = arrangement.held is None and arrangement.allows(block) and not arrangement.stacked(block)
+        return arrangement.put(block, ("pad", pad)) if possible else None
 
 
 class Stack(Goal):
@@ -123,7 +123,7 @@ class Stack(Goal):
     def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
         """See `Goal`: towers have two blocks."""
         upper, lower = referents.blocks
-        return arrangement.on_block(upper, lower) if arrangement.allows(upper) else None
+        return arrangement.put(upper, ("block", lower)) if arrangement.allows(upper) else None
 
 
 class Stay(Goal):
