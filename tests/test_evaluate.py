@@ -18,7 +18,7 @@ from vla.jobs.evaluate import require_possible
 from vla.parallel.pool import Cluster
 from vla.reports.evaluation import summary, write_report
 from vla.rollouts.evaluate import evaluate
-from vla.rollouts.recordings import chosen, merge_recordings
+from vla.rollouts.recordings import chosen, keep_pictures, merge_recordings
 from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.runs.folder import read_report
@@ -190,6 +190,18 @@ def test_an_episode_that_kills_its_process_is_an_error_and_the_others_are_played
     assert len(report.results) == len(SEEDS)
 
 
+def test_of_episodes_side_by_side_only_the_one_that_kills_their_process_is_an_error() -> None:
+    kept = list[int]()
+    report = evaluate(
+        *(toy.make_deadly_environment, toy.make_agent, None, SEEDS, Cluster(2, "beside")),
+        lanes=2,
+        keep=lambda result: kept.append(result.seed),
+    )
+    assert [error.seed for error in report.errors] == [toy.DEADLY_SEED]
+    assert [result.seed for result in report.results] == [*SEEDS]
+    assert sorted(kept) == [seed for seed in SEEDS if seed != toy.DEADLY_SEED]
+
+
 def test_a_process_that_dies_once_costs_nothing(tmp_path: Path) -> None:
     expected = evaluate(toy.make_environment, toy.make_agent, None, SEEDS)
     make_environment = partial(toy.OnceDeadlyEnvironment, tmp_path / "died")
@@ -232,6 +244,8 @@ def test_recordings_are_kept_in_one_file_failures_first(tmp_path: Path) -> None:
     assert merge_recordings(report, folder, target, 3) == [SEEDS[3], SEEDS[0], SEEDS[1]]
     kept = [entry.recording_id.rpartition("-")[0] for entry in RrdReader(target).recordings()]
     assert kept == ["failure-01000003-timeout", "success-01000000", "success-01000001"]
+    assert merge_recordings(report, folder, target, 3) == [SEEDS[3], SEEDS[0], SEEDS[1]]  # as after a lost report
+    keep_pictures(report, folder, 3)
     assert list(tmp_path.iterdir()) == [target]
 
 

@@ -158,6 +158,14 @@ def test_rounds_resume_with_their_own_config(tmp_path: Path) -> None:
     assert (resumed.improve.rounds, resumed.improve.steps, resumed.trainer.max_steps) == (5, 7, 9)
 
 
+def test_the_folder_of_a_training_without_rounds_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints/last.ckpt").touch()
+    with pytest.raises(ValueError, match=rf"{tmp_path} has a training without rounds: choose another output=DIR"):
+        improve.run(Experiment.of(composed(f"output={tmp_path}", "job=improve")))
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoints"]
+
+
 @pytest.mark.parametrize("change", ["seed=1", "trainer.max_steps=5", "+trainer.max_time={hours: 1}", "improve.steps=5"])
 def test_a_folder_with_other_rounds_or_longer_trainings_is_left_alone(tmp_path: Path, change: str) -> None:
     there = (f"output={tmp_path}", "job=improve")

@@ -14,7 +14,7 @@ from scipy.special import betaln
 from vla.parallel.pool import Cluster
 from vla.rollouts.comparison import Pairs, compare_pairs
 from vla.rollouts.evaluate import evaluate
-from vla.rollouts.recordings import merge_recordings
+from vla.rollouts.recordings import keep_pictures, merge_recordings
 from vla.rollouts.results import Report, Result
 from vla.rollouts.sequential import (
     anytime_difference,
@@ -124,6 +124,7 @@ def test_recordings_of_episodes_that_do_not_count_are_removed(tmp_path: Path) ->
     )
     recorded = merge_recordings(report, folder, tmp_path / "rollouts.rrd", "all")
     assert sorted(recorded) == [each.seed for each in report.results]
+    keep_pictures(report, folder, "all")
     assert [path.name for path in tmp_path.iterdir()] == ["rollouts.rrd"]
 
 

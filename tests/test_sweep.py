@@ -12,7 +12,7 @@ from figures import panels, points, spans, texts
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from vla.reports.comparison import Compared, compare
+from vla.reports.comparison import Compared, common_episodes, compare
 from vla.reports.comparison_page import results_table, tabulate
 from vla.reports.evaluation import write_report
 from vla.reports.tables import Table
@@ -20,7 +20,9 @@ from vla.rollouts.comparison import SUCCESS, compare_samples
 from vla.rollouts.results import Report, Result
 from vla.rollouts.sequential import anytime_interval
 from vla.rollouts.statistics import pooled_interval
+from vla.runs.folder import read_run
 from vla.runs.sweep import SweepRow, read_rows
+from vla.spec import FIRST_SEED
 
 
 def cell(
@@ -44,6 +46,17 @@ def cell(
     )
     size = {"parameters": 2_000_000, "latency_ms": latency}
     write_report(plain, folder / "report.json", None, {}, size, dict.fromkeys(conditions, other))
+
+
+def test_worlds_are_the_same_whether_a_condition_makes_them_or_the_task_is_so(tmp_path: Path) -> None:
+    report, levels = Report(tuple(Result(FIRST_SEED + n, "success") for n in range(3))), {}
+    for level in ("default", "wide"):
+        config = {"task": {"randomize": level}, "evaluate": {"conditions": {"wide": {"randomize": "wide"}}}}
+        (tmp_path / level).mkdir()
+        write_report(report, tmp_path / level / "report.json", None, config, {}, {"wide": report})
+        levels[level] = read_run(tmp_path / level)
+    assert len(common_episodes(levels["default"], levels["wide"], "wide")) == 3
+    assert not common_episodes(levels["default"], levels["wide"], "seen")
 
 
 def printed(table: Table) -> str:
