@@ -6,6 +6,7 @@ components.
 
 from __future__ import annotations
 
+import logging
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -34,8 +35,11 @@ GAP = 0.3  # longest time between two commands of one motion [s]
 MEASURED_WITHIN = 0.2  # largest time between an observation and its joint state [s]
 STILL, STILL_OPENING = 0.01, 0.002  # an arm that has moved less [rad], and its gripper [m], is at rest
 LEAD = 0.1  # of a person's motion that are kept before it begins and after it ends [s]
+LATE = 1.5  # longest time between two steps without a warning [control periods]
 SHORTEST = 0.5  # shorter segments are left out [s]
 MOSTLY = 0.5  # largest share of a component's actions beyond its bounds; a larger one means other units
+
+log = logging.getLogger(__name__)
 
 Track = list[tuple[float, Array]]  # positions over time
 WHEN = itemgetter(0)
@@ -55,6 +59,10 @@ class _Segment(NamedTuple):
     person: bool
     start: float
     end: float
+
+    def __str__(self) -> str:
+        """Format the time and the instruction."""
+        return f"{self.start:.1f} to {self.end:.1f} s, '{messages.shorten(self.instruction)}'"
 
 
 class _Step(NamedTuple):
@@ -80,6 +88,7 @@ class _Bag:
         with opened(folder) as reader:
             self.kinds = {connection.topic: connection.msgtype for connection in reader.connections}
             status = next((topic for topic in self.kinds if topic.endswith(STATUS)), None)
+            self._has_status = status is not None
             self._person = None if status else True  # who moves the arm: True, False (the policy) or nobody
             handlers: dict[str | None, Callable[[float, Any], None]] = {
                 **{topics.joint_states: self._measure, topics.finger_states: self._measure},
@@ -125,6 +134,12 @@ class _Bag:
             if what is not None and end - start >= SHORTEST:
                 yield _Segment(what[1], what[2], start, end)
 
+    def sees(self, camera: str, segment: _Segment) -> bool:
+        """Return whether there are images of a camera in a segment."""
+        within = self.inputs[bisect_left(self.inputs, segment.start, key=WHEN) :]
+        pictures = (each for at, each in within if isinstance(each, _Picture) and at <= segment.end)
+        return any(each.camera == camera and each.taken >= segment.start for each in pictures)
+
     def _see(self, camera: str, at: float, message: Any) -> None:
         if not hasattr(message, "format"):
             messages.image_from(message)  # compressed ones are decoded when they are needed
@@ -132,15 +147,21 @@ class _Bag:
         self.inputs.append((at, _Picture(camera, at - age)))
 
     def _measure(self, at: float, message: Any) -> None:
-        if (measured := self._joint_states.read(message, at)) is None:
+        taken = at - age_of((message.header.stamp.sec, message.header.stamp.nanosec), self._start + at)
+        if (measured := self._joint_states.read(message, taken)) is None:
             raise UserError("they hold the fingers alone")
-        self.inputs.append((at, Measured(at, *measured)))
-        self.measured.append((at, np.append(measured[0], measured[2])))
+        taken = max(taken, self.measured[-1][0]) if self.measured else taken
+        self.inputs.append((at, Measured(taken, *measured)))
+        self.measured.append((taken, np.append(measured[0], measured[2])))
         moved = self._instruction and self._person is not None
         self._followed.append((self._number, self._instruction, bool(self._person)) if moved else None)
 
     def _instruct(self, at: float, message: Any) -> None:
-        said = message.data.strip()[:LONGEST_INSTRUCTION]
+        said = message.data.strip()
+        if len(message.data) > LONGEST_INSTRUCTION:  # which the node drops
+            raise UserError(f"an instruction of {len(message.data)} characters")
+        if not said and self._has_status:  # which stops the node, and its status tells until when
+            return
         self._number += said != self._instruction or at - self._said_at > REPEATED
         self._instruction, self._said_at = said, at
 
@@ -197,7 +218,8 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         bags = _read_bags(folder, topics, robot)
         for bag in bags:
             bag.require(*self._cameras)
-        self._episodes = [(bag, segment, self._steps(bag, segment)) for bag, segment in _segments(bags)]
+        found = _segments(bags, spec.cameras)
+        self._episodes = [(bag, segment, self._steps(bag, segment)) for bag, segment in found]
         self._actions = [
             np.array([self._action(bag, segment, step.taken) for step in steps])
             for bag, segment, steps in self._episodes
@@ -223,7 +245,7 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         taken = [each.taken for each in pictures if each.camera == cameras[0]]
         period = float(np.median(np.diff(taken))) if len(taken) > 1 else 0.0
         rate = round(1 / period, 1) if period > 0 else 1.0
-        return imported.Recording(cameras, rate, joints, joints, bounds, len(_segments(bags)))
+        return imported.Recording(cameras, rate, joints, joints, bounds, len(_segments(bags, cameras)))
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -248,24 +270,27 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         """Return the steps of a segment, made as the policy node makes its observations; a UserError without any."""
         observer, steps, period = Observer(self.spec), list[_Step](), 1 / self.spec.control_hz
         first = bisect_left(bag.inputs, segment.start - HISTORY, key=WHEN)
-        last, stop = -np.inf, bisect_right(bag.inputs, segment.end, key=WHEN)
+        stop = bisect_right(bag.inputs, segment.end, key=WHEN)
+        last, nominal, longest = -np.inf, -np.inf, 0.0  # step, time of the next one, and time between two [s]
         for now, each in bag.inputs[first:stop]:
             if isinstance(each, Measured):
                 observer.add_joint_state(each)
                 continue
             observer.add_image(each.camera, np.array(now), each.taken)
-            at = observer.due(last, last + period)
+            at = observer.due(last, nominal)
             if at is None or observer.newest is None or not segment.start <= at <= segment.end - period:
                 continue
             measured = observer.measured_at(at)
             if abs(measured.at - at) <= MEASURED_WITHIN:
-                last, arrivals = at, {camera: float(image) for camera, image in observer.images.items()}
+                longest = max(longest, at - last if steps else 0.0)
+                # Early images must not make all later steps early, too.
+                last, nominal = at, (at if at - nominal > period / 2 else nominal) + period
+                arrivals = {camera: float(image) for camera, image in observer.images.items()}
                 steps.append(_Step(at, arrivals, observer.state(measured)))
         if not steps:
-            raise UserError(
-                f"{bag.folder} has no matching images of {', '.join(self.spec.cameras)} from {segment.start:.1f} to "
-                f"{segment.end:.1f} s, in '{messages.shorten(segment.instruction)}'"
-            )
+            raise UserError(f"{bag.folder} has no matching images of {', '.join(self.spec.cameras)} in {segment}")
+        if longest > LATE * period:
+            log.warning("%s: no images for up to %.2f s in %s", bag.folder, longest, segment)
         return steps
 
     def _images(self, bag: _Bag, steps: Sequence[_Step]) -> dict[tuple[str, float], Array]:
@@ -315,8 +340,14 @@ def _read_bags(folder: Path | str | None, topics: Topics, limits: JointLimits) -
     return [_Bag(each, topics, limits) for each in inside or [Path(folder)]]
 
 
-def _segments(bags: Sequence[_Bag]) -> list[tuple[_Bag, _Segment]]:
-    """Return the segments that are episodes; a UserError if there are none."""
-    if found := [(bag, segment) for bag in bags for segment in bag.segments()]:
+def _segments(bags: Sequence[_Bag], cameras: Sequence[str]) -> list[tuple[_Bag, _Segment]]:
+    """Return the segments that are episodes: those with images of all cameras; a UserError if there are none."""
+    found = []
+    for bag, segment in ((each, segment) for each in bags for segment in each.segments()):
+        if blind := [camera for camera in cameras if not bag.sees(camera, segment)]:
+            log.warning("%s: left out, because it has no image of %s: %s", bag.folder, ", ".join(blind), segment)
+        else:
+            found.append((bag, segment))
+    if found:
         return found
-    raise UserError(f"{bags[0].folder} has no instruction that an arm followed")
+    raise UserError(f"{bags[0].folder} has no instruction that an arm followed in view of {', '.join(cameras)}")

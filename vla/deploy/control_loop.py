@@ -135,7 +135,7 @@ class ControlLoop:
         (UserError: the arm moves, is outside its limits, or has no recent joint state; the person keeps it)."""
         measured = self._observer.newest
         if measured is None or now - measured.at > self.safety.joints_age:
-            raise UserError(f"the newest joint state is older than {self.safety.joints_age} s")
+            raise UserError(self._joints_problem(measured, now))
         if self._observer.moved(STILL_FOR) > STILL:
             raise UserError("the arm still moves: let it rest first")
         self.motion.start(measured.joints, None, now)
@@ -183,23 +183,27 @@ class ControlLoop:
             return observation
         return replace(observation, running=Running(self._planned[-rest:], min(self.delays.longest, rest)))
 
-    def set_plan(self, actions: Array) -> None:
+    def set_plan(self, actions: Array) -> bool:
         """Schedule the policy's actions (k, D); the first one starts at the time of the observation.
+
+        Returns whether the arm follows them: not if they are unusable, or answer an observation of before.
 
         Actions in the past are skipped, but still count towards the goals of later Cartesian ones.
         """
         pending, self._pending = self._pending, None
         if pending is None:  # the arm has been handed over in the meantime
-            return
+            return False
         try:
             waypoints = self.goals.of(actions, pending.observed, pending.anchor)
         except UserError as error:
-            return self._count_rejection(str(error))
-        if self.state is State.RUNNING and not pending.outdated:
+            self._count_rejection(str(error))
+            return False
+        if follows := self.state is State.RUNNING and not pending.outdated:
             self.rejections, self._planned = 0, actions
             # An arm that does not follow its commands is where it is measured, not where it was commanded.
             measured = None if self._follows_positions else self._observer.newest
             self.motion.follow(waypoints, None if measured is None else measured.joints)
+        return follows
 
     def reject_plan(self, reason: str) -> None:
         """Count a failed inference, unless the arm has been handed over since it began."""
@@ -232,6 +236,8 @@ class ControlLoop:
         if newest is None:
             return
         if not self.motion.started and self.state is not State.FAULT:  # which a person must look at first
+            if old := self._joints_problem(newest, now):  # the arm may be elsewhere by now
+                return self._set_state(self.state, old)
             self._take_over(newest, now)
         off_track, moved_unseen = self._tracking.check(self.motion, newest, now)
         if moved_unseen or (off_track and self._held):
@@ -272,11 +278,16 @@ class ControlLoop:
         """Describe which input or inference is overdue; empty if none is."""
         if problem := self.obstacle or self._observer.image_problem(now, self.safety.image_age):
             return problem
-        if now - newest.at > self.safety.joints_age:
-            return f"the newest joint state is older than {self.safety.joints_age} s"
+        if old := self._joints_problem(newest, now):
+            return old
         if self._pending is not None and now - self._pending.since > self.safety.inference:
             return f"inference takes longer than {self.safety.inference} s"
         return ""
+
+    def _joints_problem(self, newest: Measured | None, now: float) -> str:
+        """Say that the newest joint state is too old; empty if it is not."""
+        recent = newest is not None and now - newest.at <= self.safety.joints_age
+        return "" if recent else f"the newest joint state is older than {self.safety.joints_age} s"
 
     def _set_state(self, state: State, reason: str) -> None:
         if state is not self.state:

@@ -40,7 +40,8 @@ class Inputs:
         topics = settings.topics
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # matches every publisher
         for camera in loop.spec.cameras:
-            kind = CompressedImage if topics.images[camera].endswith(COMPRESSED) else Image
+            remapped = node.resolve_topic_name(topics.images[camera])
+            kind = CompressedImage if remapped.endswith(COMPRESSED) else Image
             node.add_subscription(kind, topics.images[camera], partial(self._on_image, camera), best_effort)
         for topic in filter(None, {topics.joint_states, topics.finger_states}):
             node.add_subscription(JointState, topic, self._on_joint_state, best_effort)
@@ -81,8 +82,9 @@ class Inputs:
         if not self._node.active:
             return
         try:
-            measured = self._joint_states.read(message, now)
-            age = self._age("fingers" if measured is None else "arm", message)
+            of_arm = not {*message.name}.isdisjoint(self._loop.limits.joints)
+            age = self._age("arm" if of_arm else "fingers", message)
+            measured = self._joint_states.read(message, now - age)
         except UserError as error:
             return self._diagnostics.drop(f"joint states: {error}")
         if measured is not None:

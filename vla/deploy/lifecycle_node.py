@@ -14,10 +14,11 @@ from typing import Any
 
 from rclpy.action import ActionClient
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from vla.io.errors import UserError
 
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # whoever comes later gets the last message
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -58,13 +59,13 @@ class GuardedLifecycleNode(LifecycleNode):
         subscription = self.create_subscription(kind, topic, self.guard(callback), qos)
         self.created.callback(self.destroy_subscription, subscription)
 
-    def add_publisher(self, kind: type, topic: str, while_active: bool = False) -> Any:
+    def add_publisher(self, kind: type, topic: str, while_active: bool = False, qos: QoSProfile | int = 10) -> Any:
         """Create a publisher that publishes always or only `while_active`."""
         if while_active:
             publisher: Any = self.create_lifecycle_publisher(kind, topic, 1)
             self.created.callback(self.destroy_lifecycle_publisher, publisher)
         else:
-            publisher = super(LifecycleNode, self).create_publisher(kind, topic, 10)
+            publisher = super(LifecycleNode, self).create_publisher(kind, topic, qos)
             self.created.callback(self.destroy_publisher, publisher)
         return publisher
 

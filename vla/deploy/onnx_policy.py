@@ -33,7 +33,7 @@ Inputs = dict[str, Tensor]
 Run = Callable[[Inputs], Tensor]
 
 TOLERANCE = 1e-3  # largest difference between the outputs of a program and of the model, relative to their range
-INSTRUCTIONS = ("go", "do this first, and then something else")  # of different lengths
+INSTRUCTIONS = ("go", "do this first, and then something else " * 5)  # of different lengths
 
 
 class Program(nn.Module):

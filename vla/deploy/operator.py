@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from multiprocessing.process import BaseProcess
@@ -14,10 +15,10 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.duration import Duration
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from vla.deploy.lifecycle_node import LATCHED
 from vla.deploy.messages import SimulatedEpisode
 from vla.io.errors import UserError
 from vla.rollouts.motion import Motion
@@ -27,7 +28,7 @@ log = logging.getLogger(__name__)
 
 TIMEOUT = 10.0  # of the discovery of a subscriber or service, of a service call, and of a status [s]
 SETTLED = 0.7  # discovery is complete after so long without a new subscriber [s]
-START, EPISODE = 60.0, 60.0  # longest start of both nodes of the demo, and longest episode [s]
+START = 60.0  # longest start of both nodes of the demo [s]
 AGENT, SIMULATOR = "/vla_agent", "/vla_simulator"
 
 
@@ -45,7 +46,7 @@ class Operator:
         self.node, self._processes = node, processes
         self._words = node.create_publisher(String, topic, 1)
         self.status: DiagnosticStatus | None = None  # newest of the agent
-        node.create_subscription(DiagnosticStatus, f"{AGENT}/status", self._on_status, 10)
+        node.create_subscription(DiagnosticStatus, f"{AGENT}/status", self._on_status, LATCHED)
 
     @property
     def values(self) -> dict[str, str]:
@@ -134,15 +135,14 @@ class DemoOperator(Operator):
     def __init__(self, node: Any, topic: str, stopped: Event, agent: BaseProcess, simulator: BaseProcess) -> None:
         super().__init__(node, topic, (agent, simulator))
         self.stopped = stopped
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        node.create_subscription(String, f"{SIMULATOR}/episode", self._on_episode, latched)
+        node.create_subscription(String, f"{SIMULATOR}/episode", self._on_episode, LATCHED)
         self._episode: SimulatedEpisode | None = None
         self.wait(lambda: self._words.get_subscription_count() >= 2, "both nodes to subscribe", START)
 
     def play(self) -> Result | None:
         """Play one episode; return None if it was interrupted."""
         self.begin_episode()
-        self.wait(lambda: not self._playing or self.stopped.is_set(), "the end of an episode", EPISODE)
+        self.wait(lambda: not self._playing or self.stopped.is_set(), "the end of an episode", math.inf)
         episode = self._episode
         assert episode is not None
         if not episode.done:

@@ -48,12 +48,19 @@ class PolicyNode(GuardedLifecycleNode):
         if unnamed := sorted(set(spec.cameras) - set(topics.images)):
             missing = ", ".join(unnamed)
             raise UserError(f"no topic for the policy's cameras {missing}: add +deploy.topics.images.{unnamed[0]}")
-        execute = self.policy.execute if getattr(self.policy, "chunking", None) else None
+        execute = None
+        if getattr(self.policy, "chunking", None):  # a history wants to see every step
+            execute = 1 if getattr(self.policy, "history", 1) > 1 else self.policy.execute
         follows = not settings.dry_run
         loop = ControlLoop(spec, settings.robot, settings.safety, settings.command_hz, follows, execute)
         if settings.gripper is not None and not (loop.goals.has_gripper and topics.gripper):
             raise UserError(
                 "deploy/gripper needs a policy that moves a gripper, and its action server in deploy.topics.gripper"
+            )
+        if loop.goals.has_gripper and not settings.moves_gripper:
+            self.get_logger().warning(
+                "the policy moves a gripper, and nothing commands it: set deploy.topics.gripper, with "
+                "deploy.robot.fingers or deploy/gripper"
             )
         self._inference = Inference(self.policy)
         self._inference.warm_up()
@@ -66,6 +73,7 @@ class PolicyNode(GuardedLifecycleNode):
         self.add_service(Trigger, "~/resume", self._on_resume)
         self.add_service(SetBool, "~/hand_over", self._on_hand_over)
         self.loop = loop
+        self.diagnostics.report()
 
     @transition
     def on_activate(self, state: LifecycleState) -> None:
@@ -190,9 +198,9 @@ class PolicyNode(GuardedLifecycleNode):
         try:
             if (done := inference.take()) is not None:
                 plan, seconds = done
-                loop.set_plan(plan)
-                delay = time.monotonic() - loop.observed_at
-                loop.delays.add(delay)
+                follows, delay = loop.set_plan(plan), time.monotonic() - loop.observed_at
+                if follows:
+                    loop.delays.add(delay)
                 self.diagnostics.record("inference", seconds)
                 self.diagnostics.record("image to command", delay)
         except Exception as error:

@@ -150,6 +150,12 @@ class PolicySettings(NodeSettings):
     safety: Safety
     autostart: bool
 
+    @property
+    def moves_gripper(self) -> bool:
+        """Whether commands of a gripper go anywhere."""
+        positions = self.robot.fingers and (self.command == "joint_state" or self.topics.gripper)
+        return bool(self.gripper or positions)
+
 
 @dataclass(kw_only=True)
 class SimulatorSettings(NodeSettings):

@@ -10,12 +10,13 @@ from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from vla.deploy import messages
+from vla.deploy.lifecycle_node import LATCHED
 from vla.deploy.messages import SimulatedEpisode
 from vla.deploy.settings import SimulatorSettings
 from vla.io.errors import UserError
@@ -51,12 +52,11 @@ class SimulatorNode(Node):
         self.environment, self._drivable, self._limits, self.seed = environment, environment, limits, settings.seed - 1
         self._period, self._frame_period, self._command_timeout = 1 / rates[0], 1 / rates[1], settings.command_timeout
         qos = QoSProfile(depth=1)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._images = {
             camera: self.create_publisher(Image, topics.images[camera], qos) for camera in environment.spec.cameras
         }
         self._joints = self.create_publisher(JointState, topics.joint_states, qos)
-        self._episode = self.create_publisher(String, "~/episode", latched)
+        self._episode = self.create_publisher(String, "~/episode", LATCHED)
         self.create_subscription(JointState, topics.commands, self._on_command, qos)
         self.create_subscription(String, topics.instruction, self._on_instruction, qos)
         self.create_service(Trigger, "~/reset", self._on_reset)

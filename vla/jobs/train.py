@@ -19,6 +19,7 @@ from vla.data.episodes import EpisodeStore
 from vla.io.errors import UserError
 from vla.io.files import atomic_path, warn_on_error, writing
 from vla.jobs.collect import demonstration_spec, demonstrations
+from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.models.policy_folder import POLICY
@@ -182,7 +183,8 @@ def _warn_of_tokenization(model: Model, stores: list[EpisodeStore]) -> None:
                 finer = "tokenizer=uniform and more tokenizer.bins are finer"
                 text = "as tokens, the demonstrated actions lose %.1f %% of the range of %s on average: %s"
                 log.warning(text, 100 * lost, component, finer)
-        if outside := out_of_bounds(model.tokenizer, chunks):
+        clips = model.uses_tokens or isinstance(model, Diffusion)
+        if clips and (outside := out_of_bounds(model.tokenizer, chunks)):
             where = f"{100 * outside:.2g} % of the demonstrated actions in {store.folder}"
             log.warning("%s exceed the bounds of the tokenizer, to which they are clipped", where)
 

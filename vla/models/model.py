@@ -175,7 +175,7 @@ class Model(nn.Module, ABC):
             frames = output["truth"].shape[1]
             truth = batch["truth"][:, -frames:]
             known = batch["present"][:, -frames:] & truth.isfinite().all(-1)
-            target = self.truth_scale(truth.nan_to_num(), known)
+            target = self.truth_scale(truth.nan_to_num(0.0, 0.0, 0.0), known)
             error = (output["truth"].float() - target).square().mean(-1)  # (B, T')
             losses["truth_loss"] = mean_where(error, known)
             losses["loss"] = losses["loss"] + self.auxiliary * losses["truth_loss"]

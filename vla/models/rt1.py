@@ -96,11 +96,14 @@ class RT1(ContextModel, TokenModel):
 
         There may be fewer frames than `history`. A batch with (B, T, N, E) "tokens" from `encode` needs no images.
         """
-        tokens = batch["tokens"] if "tokens" in batch else self.encode(batch)
+        frames = batch["tokens"] if "tokens" in batch else self.encode(batch)
+        present = batch["present"] if "present" in batch else frames.new_ones(frames.shape[:2], dtype=torch.bool)
+        tokens, back = oldest_first(frames, present)
         empty = tokens.new_zeros(*tokens.shape[:2], self.slots, tokens.shape[-1])
         hidden = self.transform(torch.cat([tokens, empty], 2).flatten(1, 2))
         hidden = hidden.unflatten(1, (tokens.shape[1], -1))  # (B, T, N + A, E)
         before_slots = hidden[:, :, self.context.per_frame - 1 : -1]  # (B, T, A, E)
+        before_slots = before_slots.gather(1, back[:, :, None, None].expand_as(before_slots))
         logits = self.head(before_slots).unflatten(2, self.logits_shape[:2])
         return {"logits": logits, **self.predict_truth(before_slots[:, :, 0])}
 
@@ -111,6 +114,14 @@ class RT1(ContextModel, TokenModel):
         for layer in self.layers:
             x = layer(x, self.mask[:length, :length])
         return x
+
+
+def oldest_first(frames: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """Roll (B, T, N, E) frames until the oldest present one is first: -, 1, 2 → 1, 2, -; and return places (B, T) that
+    undo it. A policy has its first frames in these positions, and none sees absent ones there."""
+    steps, first = torch.arange(present.shape[1], device=present.device), present.int().argmax(1, keepdim=True)
+    rolled, back = ((steps + shift) % present.shape[1] for shift in (first, -first))
+    return frames.gather(1, rolled[:, :, None, None].expand_as(frames)), back
 
 
 def attention_mask(frames: int, tokens: int, slots: int) -> Tensor:

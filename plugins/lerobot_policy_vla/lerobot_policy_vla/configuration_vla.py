@@ -19,7 +19,7 @@ class VlaConfig(PreTrainedConfig):
     """A policy of vla.
 
     Attributes:
-        checkpoint: its folder, or that of its run; in a folder of `--policy.path`, relative to it.
+        checkpoint: its folder, or that of its run; empty in a folder of `--policy.path`, which has it.
         precision: "fp32" or "bf16".
         compile: compile the model.
         lanes: environments that one pass through the model serves; unused ones are padding.

@@ -62,7 +62,7 @@ class VlaPolicy(PreTrainedPolicy):
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         """Write the policy, which holds its whole configuration, beside the configuration of LeRobot."""
         shutil.copytree(policy_folder(self.config.checkpoint), save_directory / POLICY, dirs_exist_ok=True)
-        self.config.checkpoint = POLICY
+        self.config.checkpoint = ""  # `from_pretrained` knows the place; a name would be looked for where it is run
         self.config._save_pretrained(save_directory)
         self.config.checkpoint = str(save_directory / POLICY)
 

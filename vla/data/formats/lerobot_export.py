@@ -71,7 +71,7 @@ class LeRobotExporter:
             if store.codec.images == "jpeg":
                 log.warning("%s holds JPEG, of which videos lose more: export=files loses nothing", store.folder)
             draft = place / "dataset"
-            if not _holds(draft, source):
+            if not _is_of(draft, source):
                 shutil.rmtree(draft, ignore_errors=True)
                 write_json(draft / "meta/vla.json", source)
             self._write(draft, store, cluster)
@@ -124,11 +124,19 @@ class LeRobotExporter:
 
 
 def _holds(folder: Path, source: Mapping[str, Any]) -> bool:
+    """Return whether a folder has the whole dataset of these episodes."""
     try:
         files = read_json(folder / layout.CHECKSUMS, layout.Checksums)
-        there = all((folder / name).is_file() for name in files)
-        return there and read_json(folder / "meta/vla.json", dict[str, Any], MAX_SOURCE_BYTES) == source
     except (OSError, ValueError):  # missing or incomplete
+        return False
+    return all((folder / name).is_file() for name in files) and _is_of(folder, source)
+
+
+def _is_of(folder: Path, source: Mapping[str, Any]) -> bool:
+    """Return whether a folder was begun from the same episodes, with the same options."""
+    try:
+        return read_json(folder / "meta/vla.json", dict[str, Any], MAX_SOURCE_BYTES) == source
+    except (OSError, ValueError):
         return False
 
 

@@ -12,13 +12,12 @@ from vla.io.files import atomic_path, write_json
 from vla.io.types import Text
 from vla.models.trunk_folder import CONFIG
 from vla.models.vlm.network import renamed
-from vla.models.vlm.normalizer import EPSILON, Normalizer
+from vla.models.vlm.normalizer import EPSILON, MODES, Normalizer
 from vla.models.vlm.policy import VisionLanguageAction
 from vla.models.vlm.trunk import IMAGES, NORMALIZER, PREPROCESSOR
 
 POSTPROCESSOR = "policy_postprocessor.json"
 STATE, ACTION = "observation.state", "action"
-MODES = {"mean_std": "MEAN_STD", "quantiles": "QUANTILES"}
 
 
 class LeRobotPolicyExporter:
@@ -69,7 +68,12 @@ class LeRobotPolicyExporter:
 def _config(model: VisionLanguageAction) -> dict[str, Any]:
     inputs, outputs = _features(model)
     network, mode = model.network, MODES[model.action_normalizer.kind]
-    trunk = {"vlm_model_name": model.text.name} if network.kind == "smolvla" else {}
+    of_smolvla = network.kind == "smolvla"
+    if model.place != ("corner" if of_smolvla else "centre"):
+        raise UserError(
+            f"LeRobot's {network.kind} puts images that are no squares elsewhere: train without model.place"
+        )
+    own = {"vlm_model_name": _tokenizer(model), "num_steps": model.steps}
     return {
         "type": network.kind,
         "input_features": inputs,
@@ -81,8 +85,14 @@ def _config(model: VisionLanguageAction) -> dict[str, Any]:
         "max_action_dim": network.action_width,
         "tokenizer_max_length": model.text.length,
         **network.options(),
-        **trunk,
+        **(own if of_smolvla else {"num_inference_steps": model.steps}),
     }
+
+
+def _tokenizer(model: VisionLanguageAction) -> str:
+    """Return the name of the tokenizer without a revision, which LeRobot does not take."""
+    name = str(model.text.name)
+    return name if Path(name).is_dir() else name.partition("@")[0]
 
 
 def _features(model: VisionLanguageAction) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -106,7 +116,7 @@ def _preprocessing(model: VisionLanguageAction) -> list[dict[str, Any]]:
         {"registry_name": f"{model.network.kind}_{reader}", "config": {}},
         {
             "registry_name": "tokenizer_processor",
-            "config": {**tokens, "truncation": True, "tokenizer_name": prompt.name},
+            "config": {**tokens, "truncation": True, "tokenizer_name": _tokenizer(model)},
         },
         {"registry_name": "device_processor", "config": {"device": "cpu", "float_dtype": None}},
     ]

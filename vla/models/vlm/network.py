@@ -126,6 +126,7 @@ class FlowNetwork(nn.Module, ABC):
     unused: ClassVar[tuple[str, ...]] = ()  # beginnings of published names that no action depends on
 
     kind: ClassVar[str] = ""  # LeRobot's name of the policy
+    causal: ClassVar[bool] = False  # whether an action attends to none after it
 
     state_width: int  # S, padded with zeros; 0: the state is part of the sentence
     value_width: int  # values of a token in a layer, of all heads

@@ -15,6 +15,9 @@ from torch import Tensor, nn
 from vla.io.errors import UserError
 
 Kind = Literal["mean_std", "quantiles"]
+MODES: dict[Kind, str] = {"mean_std": "MEAN_STD", "quantiles": "QUANTILES"}  # LeRobot's names
+CONSTANT = 1e-6  # largest range of a component that never changes
+RARE = 0.02  # largest share of the range between the percentiles of a component that rarely does
 EPSILON = 1e-8  # of a standard deviation, and in place of a range of 0
 
 
@@ -38,13 +41,21 @@ class Normalizer(nn.Module):
         self.register_buffer(self.statistics[0], identity)
         self.register_buffer(self.statistics[1], torch.ones(width))
 
-    def fit(self, values: np.ndarray) -> None:
-        """Take the statistics of (N, W) values."""
+    def fit(self, values: np.ndarray, constant: float = 0.0) -> None:
+        """Take the statistics of (N, W) values.
+
+        Percentiles of a component that rarely changes, such as that of a gripper, are its extremes: else its changes
+        would be huge. A component that never changes gets `constant` as its standard deviation.
+        """
+        least, most = values.min(0), values.max(0)
+        spread = np.where(most - least > CONSTANT, 0.0, constant)
         if self.kind == "mean_std":
-            fitted = {"mean": values.mean(0, dtype=np.float64), "std": values.std(0, dtype=np.float64)}
+            fitted = values.mean(0, dtype=np.float64), values.std(0, dtype=np.float64) + spread
         else:
-            fitted = dict(zip(self.statistics, np.quantile(values, (0.01, 0.99), axis=0), strict=True))
-        for name, value in fitted.items():
+            low, high = np.quantile(values, (0.01, 0.99), axis=0)
+            rare = high - low <= RARE * (most - least)
+            fitted = np.where(rare, least, low) - spread, np.where(rare, most, high) + spread
+        for name, value in zip(self.statistics, fitted, strict=True):
             getattr(self, name).copy_(torch.from_numpy(value))
 
     def take(self, statistics: Mapping[str, Tensor], feature: str, source: object) -> None:

@@ -110,7 +110,7 @@ class VisionLanguageAction(Model):
         self.state_normalizer = Normalizer(normalization, len(spec.pose))
         self.action_normalizer = Normalizer(normalization, len(spec.action))
         if statistics == "pretrained" and origin:
-            known = origin.statistics()
+            known = origin.statistics(normalization)
             self.state_normalizer.take(known, "observation.state", trunk)
             self.action_normalizer.take(known, "action", trunk)
         size = (chunk, self.network.action_width)
@@ -121,7 +121,7 @@ class VisionLanguageAction(Model):
         """Normalise by the statistics of (N, P) states and (N, D) actions, unless they are those of the trunk
         (UserError: it has none)."""
         if self.statistics == "demonstrations":
-            self.state_normalizer.fit(states[:, self.spec.pose])
+            self.state_normalizer.fit(states[:, self.spec.pose], constant=1.0)
             self.action_normalizer.fit(actions)
         elif not self.action_normalizer.known:
             raise UserError(
@@ -181,13 +181,18 @@ class VisionLanguageAction(Model):
         return F.pad(self.action_normalizer(action), (0, self.network.action_width - action.shape[-1]))
 
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
-        """Return the mean squared error of the velocity of valid actions, without padding."""
-        components = len(self.spec.action)
-        error = (output["velocity"] - output["target"])[..., :components].square().mean(-1)
-        copies = len(error) // len(batch["valid"])
-        counted = batch["valid"][:, -1].repeat(copies, 1)
+        """Return the mean squared error of the velocity of valid actions; sampling moves their padding, too.
+
+        Where actions attend to later ones, the repeated last action of an episode counts among them.
+        """
+        error = (output["velocity"] - output["target"]).square().sum(-1) / len(self.spec.action)
+        copies, ahead = len(error) // len(batch["valid"]), batch["perturbations"][:, -1]
+        counted = batch["valid"][:, -1]
+        if not self.network.causal and not self.prefix:
+            counted = counted | ((ahead < 0) & (ahead.amax(1, keepdim=True) == 0))
+        counted = counted.repeat(copies, 1)
         if self.prefix:
-            counted = after_prefix(batch["perturbations"][:, -1].repeat(copies, 1), batch["length"])
+            counted = after_prefix(ahead.repeat(copies, 1), batch["length"])
         return {"action_loss": mean_where(error, counted)}
 
     def predict(self, batch: Batch) -> Prediction:
@@ -253,6 +258,8 @@ def _cameras(named: dict[str, str | None] | None, spec: Spec, trunk: Trunk | Non
     if seen and (unknown := [camera for camera in named if camera not in seen]):
         raise UserError(f"model.cameras names {', '.join(unknown)}, and {trunk} sees {', '.join(seen)}")
     chosen = [camera for camera in named.values() if camera is not None]
+    if seen and seen != [*named]:
+        raise UserError(f"model.cameras names the cameras of {trunk} in another order: it sees {', '.join(seen)}")
     if unknown := [camera for camera in chosen if camera not in spec.cameras]:
         raise UserError(f"model.cameras names {', '.join(unknown)}, and the demonstrations have {ours}")
     if not chosen:

@@ -49,6 +49,7 @@ class SmolVLA(FlowNetwork):
     """
 
     kind = "smolvla"
+    causal = True
     published = (
         ("model.vlm_with_expert.vlm.model.", "vlm."),
         ("model.vlm_with_expert.lm_expert.", "expert."),

@@ -15,6 +15,7 @@ from vla.io.errors import UserError
 from vla.models.trunk import Source
 from vla.models.trunk_folder import CONFIG, WEIGHTS, opened, trunk_folder
 from vla.models.vlm.network import FlowNetwork, renamed
+from vla.models.vlm.normalizer import MODES, Kind
 from vla.parallel.limits import memory
 
 PREPROCESSOR = "policy_preprocessor.json"
@@ -67,8 +68,16 @@ class Trunk:
         features = self._config.get("input_features") or {}
         return [name.removeprefix(IMAGES) for name, each in features.items() if each.get("type") == "VISUAL"]
 
-    def statistics(self) -> dict[str, Tensor]:
-        """Return those of the normaliser of the policy, such as action.mean; none if it has no normaliser."""
+    def statistics(self, kind: Kind) -> dict[str, Tensor]:
+        """Return those of the normaliser of the policy, such as action.mean; none if it has no normaliser.
+
+        Raises:
+            UserError: it normalises in another way than `kind`.
+        """
+        mapping = self._config.get("normalization_mapping") or {}
+        modes = {str(mapping[each]) for each in ("STATE", "ACTION") if each in mapping}
+        if wrong := modes - {MODES[kind]}:
+            raise UserError(f"{self} normalises by {', '.join(sorted(wrong))}: set model.normalization")
         path = self.folder / PREPROCESSOR
         steps = read_json(path, dict[str, Any]).get("steps", []) if path.is_file() else []
         files = [step.get("state_file") for step in steps if step.get("registry_name") == NORMALIZER]
