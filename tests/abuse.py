@@ -22,8 +22,7 @@ import torch
 from abuse_files import bags, datasets, runs
 from abuse_kills import kills
 from abuse_messages import messages
-from crafted import hiding, listener, save
-from hostile import hostile, put
+from hostile import hiding, hostile, listener, put, save
 from saved_policies import save_run
 from trials import CHECKPOINT, EVALUATE, TRAIN, Trials, last, run
 

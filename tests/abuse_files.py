@@ -26,9 +26,6 @@ EPISODES = 4
 COLLECTED = (*SMALL[:2], f"collect.episodes={EPISODES}", "output=wrong")
 IMPORT = ("job=collect", "expert=lerobot", "expert.folder=hurt", "collect.folder=imported", *COLLECTED)
 VIDEO = f"videos/{FRONT}/chunk-000/file-000.mp4"
-PLAYED = ("/isaac/franka/joint_states", "/user/command")
-
-
 BAG = (
     *("task.joints=all", "task.units=rad", "task.image_size=[8,8]", "expert.robot.fingers=[left,right]"),
     *(
@@ -124,12 +121,12 @@ def bomb(height: int, width: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
 
 
-def pictures(content: bytes | None, path: str = "../../../etc/passwd") -> Change:
+def pictures(content: bytes | None) -> Change:
     """Let a camera's images be files in the table, all of them the same."""
 
     def change(folder: Path) -> None:
         table = pq.read_table(folder / ROWS)
-        images = pa.array([{"bytes": content, "path": path}] * len(table), PICTURE)
+        images = pa.array([{"bytes": content, "path": "../../../etc/passwd"}] * len(table), PICTURE)
         pq.write_table(table.append_column(FRONT, images), folder / ROWS)
         feature(FRONT, dtype="image", shape=[32, 32, 3], names=None)(folder)
 

@@ -39,6 +39,7 @@ class Part:
     person: bool = False  # moves the arm
     instruction: str | None = None  # sent at the start
     commands: bool = True  # are published
+    images: bool = True  # are, too
 
 
 def moving(steps: int, seed: int, gripper: float = 1.0) -> Array:
@@ -93,7 +94,8 @@ class Session:
             status = {"level": 0, "name": "vla_agent", "message": "", "hardware_id": "", "values": pairs}
             self.send("/vla_agent/status", make("diagnostic_msgs/msg/DiagnosticStatus", **status))
         for action in part.actions:
-            self._images()
+            if part.images:
+                self._images()
             start, end = self.joints, self._controller.step(action[:6]).copy()
             self.opening = float(action[6])
             for tick in range(1, 6):
@@ -104,8 +106,8 @@ class Session:
                 self.send("/joint_states", self._joint_state(self.joints))
             self.step += 1
 
-    def _header(self, age: float = 0.0) -> Any:
-        seconds, rest = divmod(START + round((self.now - age) * 1e9), 1_000_000_000)
+    def _header(self) -> Any:
+        seconds, rest = divmod(START + round(self.now * 1e9), 1_000_000_000)
         stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
         return make("std_msgs/msg/Header", stamp=stamp, frame_id="")
 

@@ -7,28 +7,19 @@ from typing import Any
 
 import composing
 from toy import ARM_SPEC, ToyEnvironment, ToyExpert
+from toy_episodes import add
 
 from vla.config.build import build
 from vla.config.experiment import plain
 from vla.data.episodes import EpisodeStore
-from vla.data.header import Codec
 from vla.rollouts.rollout import rollout
 from vla.spec import Episode, Spec
 
 
-def stored(
-    folder: Path, spec: Spec = ARM_SPEC, seeds: range = range(2), codec: Codec | None = None
-) -> tuple[EpisodeStore, list[Episode]]:
+def stored(folder: Path, spec: Spec = ARM_SPEC, seeds: range = range(2)) -> tuple[EpisodeStore, list[Episode]]:
     """A store of toy episodes; seeds that are three more than a multiple of five fail."""
     episodes = [rollout(ToyEnvironment(spec=spec), ToyExpert(), seed) for seed in seeds]
-    store = EpisodeStore.create_or_open(folder, spec, {}, codec)
-    with store.writing():
-        for episode in episodes:
-            if episode.success:
-                store.append(episode)
-            else:
-                store.fail(episode)
-    return store, episodes
+    return add(folder, episodes, spec=spec), episodes
 
 
 def composed(name: str, folder: Path, *overrides: str) -> Any:

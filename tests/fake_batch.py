@@ -16,6 +16,8 @@ from vla.models.bc import BC
 from vla.models.context import KeypointContext, TokenContext
 from vla.models.decoder import Decoder
 from vla.models.denoiser import DenoisingModel
+from vla.models.diffusion import Diffusion
+from vla.models.flow import Flow
 from vla.models.model import Model
 from vla.models.rt1 import RT1
 from vla.models.text.ngrams import NGrams
@@ -108,6 +110,12 @@ def make_act(**options: Any) -> ACT:
 def make_denoising(kind: type[DenoisingModel], **options: Any) -> DenoisingModel:
     """A small model that starts from noise."""
     return _small(kind, f"model/{kind.__name__.lower()}", {"chunk": 4, "layers": 2, "heads": 2, "copies": 8}, options)
+
+
+MODELS: dict[str, Callable[..., Any]] = {
+    **{"bc": make_bc, "rt1": make_rt1, "decoder": make_decoder, "act": make_act},
+    **{"diffusion": partial(make_denoising, Diffusion), "flow": partial(make_denoising, Flow)},
+}
 
 
 def as_policy(model: Model, spec: Spec = SPEC, **options: Any) -> Policy:

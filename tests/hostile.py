@@ -1,23 +1,28 @@
-"""Configurations that would act when they are built, if anything built them."""
+"""Configurations, policies and checkpoints of nobody here: what they hold once acted when it was read or built."""
 
 from __future__ import annotations
 
+import socket
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from composing import composed
+from saved_policies import save_policy
+from toy import SPEC
+
+from vla.config.build import build
+from vla.config.experiment import plain
 
 HANDLER = "torch.distributed.elastic.multiprocessing.subprocess_handler.subprocess_handler.SubprocessHandler"
 
 
 def command(mark: Path) -> dict[str, Any]:
     """A node that runs a command when it is built."""
-    arguments: dict[str, Any] = {
-        "args": ["-c", f"id > {mark}"],
-        "env": {},
-        "stdout": None,
-        "stderr": None,
-        "local_rank_id": 0,
-    }
-    return {"_target_": HANDLER, "entrypoint": "/bin/sh", **arguments, "numa_options": None}
+    shell: dict[str, Any] = {"entrypoint": "/bin/sh", "args": ["-c", f"id > {mark}"], "env": {}, "local_rank_id": 0}
+    return node(HANDLER, **shell, stdout=None, stderr=None, numa_options=None)
 
 
 def put(config: dict[str, Any], key: str, value: Any) -> None:
@@ -49,3 +54,82 @@ def hostile(mark: Path) -> dict[str, tuple[str, Any]]:
         "the environment": ("chosen.experiment", "${oc.env:PATH}"),
         "the working folder": ("task.goal.language.phrasings", ["take {block} ${hydra:runtime.cwd}"]),
     }
+
+
+class Hiding:
+    """A mapping whose methods are those that the file says, as PyTorch's reader makes it."""
+
+    def __init__(self, shown: dict[str, Any], *methods: str) -> None:
+        self._shown, self._hidden = shown, dict.fromkeys(methods, OrderedDict)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle as an OrderedDict with attributes."""
+        return OrderedDict, (), self._hidden, None, iter(self._shown.items())
+
+
+def python(mark: Path) -> dict[str, Any]:
+    """A node that runs Python when it is built."""
+    return node("torch._inductor.codecache.PyCodeCache.load", _args_=[f"open({str(mark)!r}, 'w')"])
+
+
+def remote(port: int, key: str | None = None) -> dict[str, Any]:
+    """An agent that connects with this port."""
+    return plain(composed("agent=remote"))["agent"] | {"url": f"ws://127.0.0.1:{port}", "api_key": key, "timeout": 1.0}
+
+
+def recorded() -> dict[str, Any]:
+    """A world of recordings, as a policy describes it."""
+    names: dict[str, Any] = {"cameras": ["front"], "state": ["a", "b"], "action": ["a", "b"], "low": [-1.0, -1.0]}
+    further = {"image_size": [16, 16], "control_hz": 5.0, "units": "1", "high": [1.0, 1.0], "joints": None}
+    return node("vla.tasks.recorded.Recorded", **names, **further)
+
+
+def hiding(config: dict[str, Any], mark: Path, port: int) -> dict[str, Any]:
+    """Attack → the configuration of a policy that ran code, or connected with a port, when it was used."""
+    perturbed = config["expert"] | {"expert": remote(port) | {"_partial_": True}}
+    secret = {**config, "task": recorded(), "expert": remote(port, "${oc.env:ATTACK_SECRET}")}
+    return {
+        "python in a number": {**config, "tokenizer": config["tokenizer"] | {"bins": python(mark)}},
+        "python in a list": {**config, "model": {**config["model"], "image": [python(mark)]}},
+        "python in a key of its own": {**config, "model": {**config["model"], "more": python(mark)}},
+        "a secret for a stranger": secret,
+        "a secret in the report": {**config, "chosen": {"experiment": "${oc.env:ATTACK_SECRET}"}},
+        "a connection of a recording": {**config, "task": recorded(), "expert": remote(port)},
+        "a connection of an expert": {**config, "expert": remote(port)},
+        "a connection within an expert": {**config, "expert": perturbed},
+    }
+
+
+def hidden(config: dict[str, Any], mark: Path) -> dict[str, Any]:
+    """Attack → the configuration of a checkpoint, whose pickle can hide what a mapping holds."""
+    methods = ("items", "values", "keys", "get", "__class__", "__iter__", "copy")
+    bins = config["tokenizer"] | {"bins": python(mark)}
+    return {
+        "python in a mapping that hides it": {**config, "tokenizer": Hiding(bins, "items", "values")},
+        "python in a mapping without methods": {**config, "tokenizer": Hiding(bins, *methods)},
+        "python in the mapping of all": Hiding({**config, "tokenizer": Hiding(bins, *methods)}, *methods),
+        "a key that is no text": {**config, "model": {**config["model"], 5: 1}},
+        "keys that are no text": {**config, "model": {True: 1, float("nan"): 2}},
+    }
+
+
+def save(folder: Path, config: Any) -> Path:
+    """Write a policy without weights of the world that its configuration describes."""
+    known = config["task"] == recorded()
+    return save_policy(folder, config, build(config["task"], "task").spec if known else SPEC)
+
+
+@contextmanager
+def listener() -> Iterator[tuple[int, Callable[[], bool]]]:
+    """A port of this machine, and whether somebody has connected with it."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.setblocking(False)
+
+        def connected() -> bool:
+            try:
+                server.accept()[0].close()
+            except BlockingIOError:
+                return False
+            return True
+
+        yield server.getsockname()[1], connected

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 import toy
 from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
 
 from vla.data.datamodule import WindowDataModule
 
@@ -48,28 +47,19 @@ class Seen(LightningModule):
         return torch.optim.Adam(self.parameters(), lr=0.1)
 
 
-def fit(
-    folder: Path,
-    steps: int,
-    accumulate: int = 1,
-    checkpoint: Path | None = None,
-    save: Path | None = None,
-    devices: int = 1,
-) -> Seen:
+def fit(folder: Path, steps: int, devices: int = 1) -> Seen:
     model = Seen()
     trainer = Trainer(
         accelerator="cpu",
         devices=devices,
         max_steps=steps,
-        accumulate_grad_batches=accumulate,
         val_check_interval=4,
         check_val_every_n_epoch=None,
         num_sanity_val_steps=0,
         logger=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        enable_checkpointing=save is not None,
-        callbacks=[ModelCheckpoint(save, "at_{step}", every_n_train_steps=1, save_top_k=-1)] if save else [],
+        enable_checkpointing=False,
     )
-    trainer.fit(model, datamodule=windows(folder), ckpt_path=checkpoint, weights_only=True)
+    trainer.fit(model, datamodule=windows(folder))
     return model

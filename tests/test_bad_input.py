@@ -75,6 +75,7 @@ NONSENSE = {
         task.randomize.size.half_size=[0,0] task.randomize.size.half_size=[10,10] task.randomize.arm.x=[5,5]
         task.goal.language.phrasings=[] expert.perturb.rate=nan expert.perturb.rate=-1 expert.perturb.noise=1e9
         expert.perturb.steps=[5,2] collect.folder= collect.seed=-1 cluster.workers=0 collect.episodes=99999999999
+        collect.images=png collect.quality=96
     """,
     "train": """
         seed=99999999999999999999 data.seed=-1 data.validation_fraction=1.5 model.chunk=0 model.chunk=-1

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import random
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import bags
@@ -16,7 +17,8 @@ from rosbags.rosbag2 import StoragePlugin
 
 from vla.config.build import build
 from vla.config.experiment import plain
-from vla.deploy.bag_import import BagDemonstrations
+from vla.deploy.bag_import import BagDemonstrations, _Picture, _Segment
+from vla.deploy.observer import Measured
 from vla.deploy.settings import Topics
 from vla.spec import Episode
 
@@ -120,6 +122,41 @@ def test_a_bag_that_does_not_fit_is_refused_in_a_sentence(bag: Path, changed: An
     with pytest.raises(ValueError, match=says) as refused:
         imported(bag, **changed)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("fps", [60.0, 25.0, 15.0])
+def test_steps_have_the_rate_of_the_task_whatever_that_of_the_cameras(fps: float) -> None:
+    demonstrations = BagDemonstrations.__new__(BagDemonstrations)
+    demonstrations.spec = replace(SPEC, cameras=("front",))
+    bag: Any = SimpleNamespace(folder="bag", inputs=[])
+    for tick in range(500):  # ten seconds
+        bag.inputs.append((0.02 * tick, Measured(0.02 * tick, np.zeros(7), np.zeros(7), 0.0)))
+    bag.inputs += [(at, _Picture("front", at)) for at in np.arange(0, 10, 1 / fps)]
+    bag.inputs.sort(key=lambda each: each[0])
+    steps = demonstrations._steps(bag, _Segment("go", False, 0.0, 10.0))
+    assert len(steps) == pytest.approx(10 * SPEC.control_hz, abs=2)
+
+
+def test_an_empty_instruction_ends_nothing_where_a_status_tells_what_goes_on(tmp_path: Path) -> None:
+    parts = (
+        bags.Part("running", bags.moving(8, 0), instruction="lift it"),
+        bags.Part("stopped", np.repeat(bags.RESTING, 3, 0), instruction=""),
+        bags.Part("handed over", bags.moving(10, 1), person=True),
+        bags.Part("holding", np.repeat(bags.RESTING, 3, 0)),
+    )
+    demonstrations = imported(bags.write(tmp_path / "bag", parts))
+    assert [demonstrations.numbers(number)[0] for number in range(len(demonstrations))] == ["lift it"] * 2
+
+
+def test_a_segment_without_images_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    parts = (
+        bags.Part("running", bags.moving(8, 0), instruction="lift it"),
+        bags.Part("running", bags.moving(8, 1), instruction="lower it", images=False),
+        bags.Part("stopped", np.repeat(bags.RESTING, 3, 0)),
+    )
+    folder = bags.write(tmp_path / "bag", parts)
+    assert len(imported(folder)) == 1 and "left out, because it has no image of front, wrist" in caplog.text
+    assert BagDemonstrations.recording(folder, asdict(TOPICS), asdict(ROBOT)).episodes == 1
 
 
 def test_images_of_another_kind_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -235,14 +235,6 @@ def test_a_model_of_one_token_per_component_takes_no_other_tokens() -> None:
     assert together.tokenizer.chunk == 5
 
 
-def test_data_is_shared_by_everything_that_does_not_change_the_episodes() -> None:
-    folder = composed().collect.folder
-    assert folder.startswith("outputs/episodes/")
-    assert composed("seed=3", "collect.episodes=7", "expert=waypoint", "cluster.workers=3").collect.folder == folder
-    assert composed("task/goal=lift").collect.folder != folder
-    assert composed("collect.seed=1").collect.folder != folder
-
-
 def test_an_axis_that_is_off_is_as_one_that_is_not_there() -> None:
     off, without = composed("task.randomize.light=null"), composed("~task.randomize.light")
     assert off.task != without.task and off.collect.folder == without.collect.folder != composed().collect.folder

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from composing import composed
-from fake_batch import as_policy, context_of, make_act, make_batch, make_decoder, make_denoising, overfit, with_text
+from fake_batch import MODELS, as_policy, context_of, make_act, make_batch, make_denoising, overfit, with_text
 from observing import act, observations
 from toy import SPEC
 
@@ -21,11 +20,7 @@ from vla.models.flow import Flow
 from vla.models.model import ContextModel
 from vla.models.tokenizers.tokenizer import Uniform
 
-HEADS: dict[str, Callable[..., ContextModel]] = {
-    "act": make_act,
-    "flow": partial(make_denoising, Flow),
-    "decoder": make_decoder,
-}
+HEADS = {name: MODELS[name] for name in ("act", "flow", "decoder")}
 CONTEXTS = {"keypoints": "model/act", "tokens": "model/decoder"}
 heads = pytest.mark.parametrize("make", HEADS.values(), ids=HEADS.keys())
 contexts = pytest.mark.parametrize("context", CONTEXTS)

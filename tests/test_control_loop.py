@@ -52,6 +52,11 @@ class World:
     def run(self, seconds: float) -> list[Command]:
         return list(self.ticks(seconds))
 
+    def begin(self) -> None:
+        """Measure, and give the first instruction."""
+        self.run(0.1)
+        self.loop.on_instruction("go", self.now)
+
     @property
     def tool(self) -> np.ndarray:
         return forward(self.joints)[0][:3, 3]
@@ -61,8 +66,7 @@ class World:
 def world() -> World:
     """A running loop."""
     world = World()
-    world.run(0.1)
-    world.loop.on_instruction("put the red block on the pad", world.now)
+    world.begin()
     world.run(0.2)
     assert world.loop.state is State.RUNNING
     return world
@@ -82,6 +86,15 @@ def test_the_measured_pose_is_held_until_there_is_an_instruction() -> None:
     assert world.loop.state is State.WAITING and "instruction" in world.loop.reason
 
 
+def test_an_arm_is_not_taken_over_where_it_was_long_ago() -> None:
+    world = World()
+    world.measures = False
+    world.loop.on_joint_state(HOME + 0.1, np.zeros(7), 0.08, world.now - SAFETY.joints_age)
+    assert world.run(0.2) == [] and "joint state is older than" in world.loop.reason
+    world.measures = True
+    assert world.run(0.2)[0].position == pytest.approx(HOME)
+
+
 def test_actions_move_the_tool_as_far_as_they_say(world: World) -> None:
     world.answer = lambda observation: 0 * FORWARD
     world.run(1.0)
@@ -96,8 +109,7 @@ def test_the_gripper_neither_opens_nor_closes_beyond_its_stroke(monkeypatch: pyt
     monkeypatch.setattr("test_control_loop.SPEC", wider)  # bounds that follow from data
     for gripper, opening in ((1.1, 1.0), (-0.1, 0.0)):
         world = World()
-        world.run(0.1)
-        world.loop.on_instruction("put the red block on the pad", world.now)
+        world.begin()
         world.answer = lambda observation, gripper=gripper: np.array([[*[0.0] * 6, gripper]])
         assert world.run(1.0)[-1].opening == opening
 
@@ -110,8 +122,7 @@ def test_a_chunk_is_executed_to_its_end_before_the_policy_is_asked_again() -> No
         return np.repeat(FORWARD, 4, 0)
 
     world.answer = answer
-    world.run(0.1)
-    world.loop.on_instruction("go", world.now)
+    world.begin()
     start = world.tool
     world.run(1.2)
     assert np.diff(asked) == pytest.approx([0.4] * (len(asked) - 1), abs=0.021) and len(asked) >= 3
@@ -129,8 +140,7 @@ def test_a_plan_to_continue_is_executed_until_the_next_one_is_there() -> None:
 
     world.answer = answer
     world.loop.delays.add(0.12)
-    world.run(0.1)
-    world.loop.on_instruction("go", world.now)
+    world.begin()
     world.run(1.2)
     assert len(asked) >= 4 and np.diff([at for at, _ in asked]) == pytest.approx([0.2] * (len(asked) - 1), abs=0.021)
     assert asked[0][1].running is None
@@ -344,8 +354,7 @@ def test_whatever_happens_in_the_hands_of_a_person_nothing_is_commanded(world: W
 def test_in_a_dry_run_every_plan_starts_where_the_arm_is() -> None:
     world = World(follows_positions=False)
     world.follows = False
-    world.run(0.1)
-    world.loop.on_instruction("go", world.now)
+    world.begin()
     commands = world.run(3.0)
     assert world.loop.state is State.RUNNING  # the arm does not follow, which is no fault
     away = np.array([forward(command.position)[0][:3, 3] for command in commands]) - world.tool
@@ -360,8 +369,7 @@ def test_the_tool_stays_in_the_workspace_whose_corners_are_any_two_opposite_ones
         move = np.zeros_like(FORWARD)
         move[:, axis], move[:, -1] = 0.01 * sign, 1
         world.answer = lambda observation, move=move: move
-        world.run(0.1)
-        world.loop.on_instruction("go", world.now)
+        world.begin()
         world.run(2.0)
         assert world.tool[axis] == pytest.approx(middle[axis] + 0.05 * sign, abs=0.002)
 
@@ -377,8 +385,7 @@ def test_the_tool_stays_in_the_workspace_where_joints_at_their_limits_bend_its_p
         faster = replace(ROBOT, acceleration=[100.0] * 7)
         world.loop = ControlLoop(SPEC, faster, world.loop.safety, 50.0)
     random = np.random.default_rng(0)
-    world.run(0.1)
-    world.loop.on_instruction("go", world.now)
+    world.begin()
     turns: list[float] = []
 
     def answer(observation: Observation) -> np.ndarray:
@@ -395,8 +402,7 @@ def test_the_tool_stays_in_the_workspace_where_joints_at_their_limits_bend_its_p
 def test_an_arm_outside_the_workspace_may_come_back() -> None:
     tool = forward(HOME)[0][:3, 3]
     world = World(replace(SAFETY, workspace=(tuple(tool - 0.3), tuple(tool + np.array([0.3, 0.3, -0.05])))))
-    world.run(0.1)
-    world.loop.on_instruction("go", world.now)
+    world.begin()
     world.answer = lambda observation: np.array([[0.0, 0, 0.01, 0, 0, 0, 1]], np.float32)  # away from it
     heights = [forward(command.position)[0][2, 3] for command in world.run(3.0)]
     assert max(heights) <= tool[2] + 1e-6 and abs(heights[-1] - (tool[2] - 0.05)) < LEEWAY
@@ -430,8 +436,7 @@ def test_a_plan_for_the_instruction_before_is_not_executed(world: World) -> None
 def test_what_was_grasped_is_held_to_the_end_of_what_was_sent_ahead() -> None:
     world = World()
     world.loop = ControlLoop(SPEC, replace(ROBOT, acceleration=[3.0] * 7), SAFETY, 50.0)
-    world.run(0.1)
-    world.loop.on_instruction("go", world.now)
+    world.begin()
     grasp = np.repeat(FORWARD, 4, 0)
     grasp[:, 6] = [1, 1, 0, 0]
     asked: list[Observation] = []
@@ -450,8 +455,7 @@ def test_the_horizon_is_continuous_with_the_commands(actions: int, longest: floa
     world = World()
     generator = np.random.default_rng(0)
     world.answer = lambda observation: generator.uniform(SPEC.low, SPEC.high, (actions, 7))
-    world.run(0.1)
-    world.loop.on_instruction("go", world.now)
+    world.begin()
     sent: list[np.ndarray] = []
     for command in world.ticks(2.0):
         planned = world.loop.motion.horizon(world.now, longest)
@@ -524,6 +528,7 @@ OTHER: Any = {"action": ("x", "y"), "units": ("m", "m"), "low": (0, 0), "high": 
             {"spec": replace(SPEC, robot=replace(ARM, home=()))},
             "arm of 7 joints, and the checkpoint lacks its home posture: train with",
         ),
+        ({"spec": replace(SPEC, robot=None)}, "deployment needs a robot, and the spec of this world has none"),
         ({"safety": replace(SAFETY, workspace=None)}, "needs a box for the tool point"),
         ({"command_hz": 5.0}, "command_hz"),
         ({"limits": replace(ROBOT, **SHORTER)}, "trained with 7 joints, the robot has 6"),
@@ -532,7 +537,7 @@ OTHER: Any = {"action": ("x", "y"), "units": ("m", "m"), "low": (0, 0), "high": 
             rf"has {ARM.joints[0]} where deploy\.robot\.joints has {ARM.joints[1]}: list .* order, {ARM.joints[0]}, ",
         ),
     ],
-    ids=["action", "units", "joints", "chain", "box", "rate", "arm", "order"],
+    ids=["action", "units", "joints", "chain", "robot", "box", "rate", "arm", "order"],
 )
 def test_a_policy_that_does_not_fit_is_refused(changed: dict[str, Any], words: str) -> None:
     fitting: dict[str, Any] = {"spec": SPEC, "limits": ROBOT, "safety": SAFETY, "command_hz": 50.0}

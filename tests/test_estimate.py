@@ -6,39 +6,18 @@ import logging
 import re
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import lightning
 import pytest
 import torch
-from defaults import defaults_of
 from fake_batch import make_bc, make_rt1
-from reading import windows
-from resuming import config, same
-from small_training import CONFIG
-from toy import SPEC
+from resuming import same, train
 
 from vla.io.errors import UserError
-from vla.models.learner import Learner
-from vla.models.model import Model
 from vla.models.vision.timm_encoders import FilmBackbone
 from vla.training import estimate
 from vla.training.estimate import Estimate, extrapolated
-from vla.training.trainer import make_trainer
 
 SIZES = {"data": {"batch_size": 8}, "model": {"width": 64, "context": {"history": 3}}}
-
-
-def train(model: Model, store: Path, output: Path, *callbacks: Any, steps: int = 3, **trainer: Any) -> dict[str, Any]:
-    """What the checkpoint of a short training holds."""
-    lightning.seed_everything(0, verbose=False)
-    made = make_trainer(config(max_steps=steps, **trainer), output / "checkpoints", *callbacks)
-    learner = Learner(**defaults_of("learner/default", lr=1e-3, warmup_steps=0), model=model, spec=SPEC, config=CONFIG)
-    data = windows(store, history=model.history, chunk=model.chunk, tokenize=model.text.tokenize)
-    made.fit(learner, datamodule=data)
-    made.save_checkpoint(output / "last.ckpt")
-    content: dict[str, Any] = torch.load(output / "last.ckpt", weights_only=True)
-    return content
 
 
 MODELS = {
@@ -52,9 +31,9 @@ MODELS = {
 @pytest.mark.parametrize("name", MODELS)
 def test_a_training_is_the_same_bit_for_bit_after_an_estimate(name: str, folder: Path, tmp_path: Path) -> None:
     contents = []
-    for callbacks in ((), (Estimate(SIZES),)):
+    for callback in (None, Estimate(SIZES)):
         torch.manual_seed(0)
-        contents.append(train(MODELS[name](), folder, tmp_path, *callbacks))
+        contents.append(train(MODELS[name](), folder, tmp_path, killer=callback, max_steps=3))
     for part in ("state_dict", "current_model_state", "optimizer_states"):
         assert same(contents[0][part], contents[1][part]), part
 
@@ -66,7 +45,7 @@ def test_it_is_said_before_and_compared_after(
     monkeypatch.setattr(estimate, "SCARCE", 0.0 if scarce else 1.0)
     advice = r"; if that is too much, lower data\.batch_size \(now 8\), model\.context" if scarce else "$"
     with caplog.at_level(logging.INFO, logger=estimate.__name__):
-        train(make_bc(), folder, tmp_path, Estimate(SIZES), steps=4, accumulate_grad_batches=2)
+        train(make_bc(), folder, tmp_path, killer=Estimate(SIZES), max_steps=4, accumulate_grad_batches=2)
     said, took = (each.getMessage() for each in caplog.records if each.name == estimate.__name__)
     numbers = re.match(
         r"needs about ([\d.]+) of ([\d.]+) GB of memory, [\d.]+ of which it has, and [\d.]+ minutes for 8 batches of "
@@ -90,7 +69,7 @@ def test_what_the_memory_cannot_hold_is_refused_before_the_first_step(
     with pytest.raises(
         UserError, match=r"training needs about [\d.]+ GB of memory, and [\d.]+ GB are there: lower data"
     ):
-        train(model, folder, tmp_path, Estimate(SIZES))
+        train(model, folder, tmp_path, killer=Estimate(SIZES))
     assert same(before, dict(model.state_dict()))
 
 

@@ -181,25 +181,16 @@ def test_a_motion_that_no_report_can_hold_is_an_error_of_its_episode(tmp_path: P
     write_report(report, tmp_path / "report.json", None, {})
 
 
-def test_an_episode_that_kills_its_process_is_an_error_and_the_others_are_played() -> None:
-    report = evaluate(toy.make_deadly_environment, toy.make_agent, None, SEEDS, Cluster(2, "beside"))
+@pytest.mark.parametrize("lanes", [1, 2])
+def test_only_the_episode_that_kills_its_process_is_an_error_also_of_those_side_by_side(lanes: int) -> None:
+    makers, kept = (toy.make_deadly_environment, toy.make_agent, None), list[Result]()
+    report = evaluate(*makers, SEEDS, Cluster(2, "beside"), lanes=lanes, keep=kept.append)
     assert [error.seed for error in report.errors] == [toy.DEADLY_SEED]
     assert report.errors[0].error == (
         "a worker process crashed twice: it ended with exit status 1; cluster.workers=1 shows the traceback"
     )
-    assert len(report.results) == len(SEEDS)
-
-
-def test_of_episodes_side_by_side_only_the_one_that_kills_their_process_is_an_error() -> None:
-    kept = list[int]()
-    report = evaluate(
-        *(toy.make_deadly_environment, toy.make_agent, None, SEEDS, Cluster(2, "beside")),
-        lanes=2,
-        keep=lambda result: kept.append(result.seed),
-    )
-    assert [error.seed for error in report.errors] == [toy.DEADLY_SEED]
     assert [result.seed for result in report.results] == [*SEEDS]
-    assert sorted(kept) == [seed for seed in SEEDS if seed != toy.DEADLY_SEED]
+    assert sorted(result.seed for result in kept) == [seed for seed in SEEDS if seed != toy.DEADLY_SEED]
 
 
 def test_a_process_that_dies_once_costs_nothing(tmp_path: Path) -> None:
@@ -275,13 +266,6 @@ def test_by_default_the_failures_and_ten_successes_are_kept() -> None:
         (0, []),
     ):
         assert [result.seed - FIRST_SEED for result in chosen(report, wanted)] == seeds
-
-
-def test_an_episode_follows_from_its_seed_alone(tmp_path: Path) -> None:
-    together = evaluate(toy.make_environment, toy.make_agent, None, SEEDS[:5])
-    alone = evaluate(toy.make_environment, toy.make_agent, toy.make_recorder(tmp_path), SEEDS[3:4])
-    assert alone.results == together.results[3:4]
-    assert [file.stem for file in tmp_path.iterdir()] == ["failure-01000003-timeout"]
 
 
 def test_a_recording_that_takes_another_course_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -123,6 +123,10 @@ def test_killed_twice_at_random_an_export_goes_on_and_ends_up_the_same(name: str
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)  # with its workers, which would otherwise write on for a moment
         assert process.wait() <= 0  # killed, or faster
+    unfinished = [path for path in killed.with_name(".killed.unfinished").rglob("*.mp4")]
+    begun = {path.name + path.parent.parent.name: path.stat().st_mtime_ns for path in unfinished}
     exporter(name, killed).export(store)
+    ended = {path.name + path.parent.parent.name: path.stat().st_mtime_ns for path in killed.rglob("*.mp4")}
+    assert begun.items() <= ended.items()  # what was encoded stays
     assert content(killed) == content(whole)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["export.py", "killed", "store", "whole"]

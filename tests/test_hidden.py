@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from composing import composed, run_job
-from crafted import hidden, hiding, listener, save
+from hostile import hidden, hiding, listener, save
 from saved_policies import save_run
 
 from vla.config.adopt import adopt, finetune

@@ -94,7 +94,7 @@ def test_statistics_are_those_of_all_rows_and_pixels(home: Path) -> None:
     assert first["stats/observation.images.front/count"] == [first["length"]]
 
 
-def test_rerun_opens_it(home: Path, tmp_path: Path) -> None:
+def test_rerun_opens_it(tmp_path: Path) -> None:
     store, _ = stored(tmp_path / "store", seeds=range(2))
     folder, recording = exporter("lerobot", tmp_path / "dataset").export(store), tmp_path / "dataset.rrd"
     command = [sys.executable, "-m", "rerun", str(folder), "--bind", "127.0.0.1", "--save", str(recording)]

@@ -124,15 +124,6 @@ def test_episodes_are_exported(folder: Path, tmp_path: Path, kind: str) -> None:
         np.testing.assert_array_equal(state, store.rows("state")[: len(state)])
 
 
-def test_what_needs_a_robot_is_refused_in_one_sentence() -> None:
-    from arm import SAFETY
-
-    from vla.deploy.control_loop import ControlLoop
-
-    with pytest.raises(ValueError, match=r"deployment needs a robot, and the spec of this world has none"):
-        ControlLoop(toy.SPEC, None, SAFETY, 50.0)  # type: ignore[arg-type]
-
-
 def test_a_store_is_verified_and_described(folder: Path) -> None:
     findings = verify_store(EpisodeStore(folder))
     require_whole(findings)

@@ -42,7 +42,7 @@ def test_hidden_characters_become_visible_and_others_stay(text: str, shown: str)
 
 
 def test_sentences_and_logs_of_a_run_are_printable() -> None:
-    assert sentence(ValueError(f"no\n{TITLE}")) == f"no {SHOWN}"
+    assert sentence(ValueError(f"no\n  {TITLE}")) == f"no {SHOWN}"
     assert sentence(OSError(2, "No such file", f"a\nerror: {TITLE}")) == f"a error: {SHOWN}: No such file"
     options: Any = OmegaConf.load(CONF / "config.yaml").hydra.job_logging.formatters.simple
     formatter = logging.config.DictConfigurator({}).configure_formatter(dict(options))

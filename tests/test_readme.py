@@ -129,6 +129,10 @@ def require_floors(measures: dict[str, dict[str, Any]]) -> None:
         assert set(measure) == {"value", "unit", "n", "floor", "ratio", "others"} and measure["n"] > 0, name
         assert all(math.isfinite(measure[key]) for key in ("value", "floor", "ratio")) and measure["floor"] > 0, name
     assert measures["train: fp32"]["n"] == 2 * 8
+    for codec in ("lossless", "jpeg"):  # 250 000 steps with three images of 224 x 224 pixels take 113 GB raw
+        speed, size = (measures[f"loader: 3 x 224 px, {codec}{of}"] for of in ("", ", 2500 x 100 steps"))
+        assert (speed["unit"], speed["n"], size["unit"]) == ("windows/s", 2 * 8, "GB")
+        assert 0 < size["value"] < 40 and size["floor"] == pytest.approx(112.9, abs=0.1)
 
 
 def test_the_benchmark_measures_every_stage_against_its_floor(folder: Path) -> None:

@@ -78,6 +78,15 @@ def test_fewer_frames_than_the_history_give_what_the_first_slots_of_a_full_windo
         assert torch.allclose(model({"tokens": tokens[:, :frames]})["logits"], full[:, :frames], atol=1e-5)
 
 
+def test_absent_frames_before_the_first_do_not_matter_as_they_are_none_in_a_policy() -> None:
+    model = make_rt1(history=3).eval()
+    tokens = model.encode(with_text(model, make_batch(3)))
+    window = torch.cat([torch.randn_like(tokens[:, :1]), tokens[:, :2]], 1)  # as in training: absent ones come first
+    present = torch.tensor([False, True, True]).expand(len(tokens), -1)
+    logits = model({"tokens": window, "present": present})["logits"]
+    assert torch.allclose(logits[:, 1:], model({"tokens": tokens[:, :2]})["logits"], atol=1e-5)
+
+
 def test_frames_are_encoded_independently() -> None:
     model = make_rt1(history=3, proprioception=True).eval()
     batch = with_text(model, make_batch(3))

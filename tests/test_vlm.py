@@ -135,6 +135,32 @@ def test_normalisation_is_invertible_and_by_the_statistics_of_the_data(kind: Any
     assert torch.allclose(normalizer.inverse(scaled), torch.from_numpy(data), atol=1e-5)
 
 
+def test_what_rarely_or_never_changes_is_normalised_without_explosions() -> None:
+    rare = np.zeros((1000, 2), np.float32)
+    rare[-5:, 0] = 1  # a gripper that closes at the end
+    normalizer = Normalizer("quantiles", 2)
+    normalizer.fit(rare)
+    assert torch.equal(normalizer(torch.tensor([[0.0, 0.0], [1.0, 0.0]]))[:, 0], torch.tensor([-1.0, 1.0]))
+    for kind in ("mean_std", "quantiles"):
+        normalizer = Normalizer(kind, 1)
+        normalizer.fit(np.full((9, 1), 3.0, np.float32), constant=1.0)
+        assert normalizer(torch.tensor([[3.5]])).abs().item() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("causal", [True, False])
+def test_repeated_last_actions_count_where_others_attend_to_them(causal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SmolVLA, "causal", causal)
+    model = make_smolvla()
+    batch = model.noised(with_text(model, make_batch(1, CHUNK, spec=SPEC)))
+    batch["perturbations"] = torch.zeros_like(batch["perturbations"])
+    batch["perturbations"][..., -1] = -1  # beyond the episode
+    batch["valid"] = batch["perturbations"] == 0
+    output = model(batch)
+    loss = model.action_loss(output, batch)["action_loss"]
+    output["target"][:, -1] += 1
+    assert (model.action_loss(output, batch)["action_loss"] != loss) == (not causal)
+
+
 def test_images_of_another_aspect_ratio_lie_in_the_corner_or_in_the_centre() -> None:
     image = torch.ones(1, 3, 20, 40)
     corner, centre = (resize_with_padding(image, 8, place)[0, 0, :, 0] for place in ("corner", "centre"))
@@ -248,6 +274,10 @@ def test_published_weights_and_statistics_are_loaded(tmp_path: Path, tokenizer: 
 
     folder = written(tmp_path / "published", tokenizer, as_bfloat16)
     cameras = {"front": "wrist", "wrist": "front"}
+    with pytest.raises(UserError, match=r"names the cameras of .* in another order: it sees front, wrist"):
+        make_smolvla(tokenizer, trunk=str(folder), cameras={"wrist": "front", "front": "wrist"})
+    with pytest.raises(UserError, match=r"normalises by MEAN_STD: set model\.normalization"):
+        make_smolvla(tokenizer, trunk=str(folder), statistics="pretrained", normalization="quantiles", cameras=cameras)
     model = make_smolvla(tokenizer, trunk=str(folder), statistics="pretrained", cameras=cameras)
     assert model.cameras == ["wrist", "front"]
     ours, theirs = make_smolvla(tokenizer), load_file(folder / "model.safetensors")
@@ -285,7 +315,7 @@ def test_factors_beside_published_weights_are_in_the_policy(frozen: list[str], t
         assert (trained - restored).abs().max() < 1e-5 < 1e-3 < (trained - before).abs().max()
 
 
-def test_a_trunk_alone_leaves_the_expert_random(tmp_path: Path, tokenizer: Path) -> None:
+def test_a_trunk_alone_leaves_the_expert_random(tmp_path: Path) -> None:
     folder = tmp_path / "trunk"
     folder.mkdir()
     (folder / "config.json").write_text('{"model_type": "smolvlm"}')

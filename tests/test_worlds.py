@@ -11,6 +11,7 @@ import pytest
 from fake_batch import as_policy, make_act, make_bc, make_denoising, make_rt1
 from toy import ToyEnvironment, ToyExpert, ToyInTurn
 
+from vla.models.diffusion import Diffusion
 from vla.models.flow import Flow
 from vla.models.model import Model
 from vla.policy import Policy
@@ -23,6 +24,7 @@ MODELS: dict[str, Callable[[], Model]] = {
     "bc": make_bc,
     "rt1": make_rt1,
     "act": partial(make_act, execute=2),
+    "diffusion": partial(make_denoising, Diffusion),
     "flow": partial(make_denoising, Flow),
 }
 

@@ -12,7 +12,7 @@ from toy import ARM_SPEC, ToyExpert, make_arm
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
 from vla.rollouts.rollout import rollout
-from vla.spec import Episode
+from vla.spec import Episode, Spec
 
 CONFIG = {"task": {"size": 1.0}, "seed": 0}
 
@@ -22,8 +22,8 @@ EPISODES = [rollout(make_arm(), ToyExpert(), seed) for seed in range(5)]  # seed
 CODECS = [Codec("raw"), Codec("lossless"), Codec("jpeg", 95)]
 
 
-def add(folder: Path, episodes: list[Episode], codec: Codec | None = None) -> EpisodeStore:
-    store = EpisodeStore.create_or_open(folder, ARM_SPEC, CONFIG, codec)
+def add(folder: Path, episodes: list[Episode], codec: Codec | None = None, spec: Spec = ARM_SPEC) -> EpisodeStore:
+    store = EpisodeStore.create_or_open(folder, spec, CONFIG, codec)
     with store.writing():
         for episode in episodes:
             if episode.success:

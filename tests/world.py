@@ -113,7 +113,6 @@ class World:
         self.statuses: list[DiagnosticStatus] = []
         self.node.create_subscription(DiagnosticStatus, "/vla_agent/status", self.statuses.append, 100)
         self.joints = HOME.copy()
-        self.cameras, self.measures = list(SPEC.cameras), True
         self.changed: Callable[[Image], None] = lambda image: None
         self.measured: Callable[[JointState], None] = lambda state: None
         self.clock = self.node.create_publisher(Clock, "/clock", 1)
@@ -138,16 +137,15 @@ class World:
             if self.simulated is not None:
                 self.simulated += 0.02
                 self.clock.publish(Clock(clock=self._now()))
-            if self.measures:
-                if self.follow is not None:
-                    self.joints = self.follow(self.joints)
-                elif self.commands:
-                    self.joints = positions(self.commands[-1])[0]
-                measured = joint_state(self.joints)
-                self.measured(measured)
-                self.states.publish(measured)
+            if self.follow is not None:
+                self.joints = self.follow(self.joints)
+            elif self.commands:
+                self.joints = positions(self.commands[-1])[0]
+            measured = joint_state(self.joints)
+            self.measured(measured)
+            self.states.publish(measured)
             if tick % 5 == 0:
-                for camera in self.cameras:
+                for camera in SPEC.cameras:
                     image = messages.fill_image(Image(), np.zeros((8, 8, 3), np.uint8), camera)
                     image.header.stamp = self._now()
                     self.changed(image)

@@ -181,11 +181,11 @@ class VisionLanguageAction(Model):
         return F.pad(self.action_normalizer(action), (0, self.network.action_width - action.shape[-1]))
 
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
-        """Return the mean squared error of the velocity of valid actions; sampling moves their padding, too.
+        """Return the mean squared error of the velocity of valid actions, without padding.
 
         Where actions attend to later ones, the repeated last action of an episode counts among them.
         """
-        error = (output["velocity"] - output["target"]).square().sum(-1) / len(self.spec.action)
+        error = (output["velocity"] - output["target"])[..., : len(self.spec.action)].square().mean(-1)
         copies, ahead = len(error) // len(batch["valid"]), batch["perturbations"][:, -1]
         counted = batch["valid"][:, -1]
         if not self.network.causal and not self.prefix:
