@@ -77,9 +77,14 @@ MODEL = """
 """
 
 
-def gallery(lights: str, floor: str = "2 2 .1") -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Return the model under some of `LIGHTS`, with a floor of this size, and its state."""
-    model = mujoco.MjModel.from_xml_string(MODEL.replace("LIGHTS", LIGHTS[lights]).replace("FLOOR", floor))
+def compiled(text: str, files: dict[str, bytes] | None = None) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Return a model and its state."""
+    model = mujoco.MjModel.from_xml_string(text, files)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     return model, data
+
+
+def gallery(lights: str, floor: str = "2 2 .1") -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Return the model under some of `LIGHTS`, with a floor of this size, and its state."""
+    return compiled(MODEL.replace("LIGHTS", LIGHTS[lights]).replace("FLOOR", floor))

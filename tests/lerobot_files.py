@@ -56,8 +56,6 @@ def changed(home: Path, folder: Path, *changes: Change) -> Path:
 
 
 def info(change: Callable[[Any], object]) -> Change:
-    """Change the description."""
-
     def apply(dataset: Path) -> None:
         content = json.loads((dataset / INFO).read_text())
         change(content)
@@ -67,7 +65,6 @@ def info(change: Callable[[Any], object]) -> Change:
 
 
 def rows(change: Callable[[pa.Table], pa.Table]) -> Change:
-    """Change the table of steps."""
     return lambda dataset: pq.write_table(change(pq.read_table(dataset / ROWS)), dataset / ROWS)
 
 
@@ -88,7 +85,6 @@ def png(image: Image.Image) -> bytes:
 
 
 def as_file(image: Image.Image, format: str, **options: Any) -> bytes:
-    """The file of an image."""
     file = io.BytesIO()
     image.save(file, format, **options)
     return file.getvalue()

@@ -17,10 +17,11 @@ def played(environment: Environment, seed: int, steps: int) -> list[Observation]
 
 
 def same(one: list[Observation], other: list[Observation]) -> bool:
-    """Whether states, truth and pictures are the same, bit for bit."""
+    """Whether states, truth, pictures and depths are the same, bit for bit."""
     return all(
         np.array_equal(a.state, b.state)
         and all(np.array_equal(a.rgb[name], b.rgb[name]) for name in a.rgb)
+        and all(np.array_equal(a.depth[name], b.depth[name]) for name in a.depth)
         and all(np.array_equal((a.truth or {})[name], (b.truth or {})[name]) for name in a.truth or {})
         for a, b in zip(one, other, strict=True)
     )

@@ -88,7 +88,7 @@ NONSENSE = {
         trainer.accumulate_grad_batches=0 trainer.devices=-7 trainer.val_check_interval=0.5
         trainer.val_check_interval=null trainer.max_epochs=3 trainer.max_epochs=null trainer.devices=abc
         trainer.devices='1,x' trainer.gradient_clip_val=-1 trainer.limit_val_batches=-1 +trainer.limit_train_batches=0
-        trainer.precision=17
+        trainer.precision=17 model.text.words=2147483647
     """,
     "evaluate": """
         evaluate.episodes=0 evaluate.seed=3 policy.precision=16

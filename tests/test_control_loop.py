@@ -34,7 +34,7 @@ class World:
         for tick in range(round(seconds * 50)):
             self.now += 0.02
             if self.measures:
-                self.loop.on_joint_state(self.joints, np.zeros(7), 0.08, self.now)
+                self.loop.on_joint_state(self.joints, np.zeros_like(self.joints), 0.08, self.now)
             if tick % 5 == 0:
                 for camera in self.cameras:
                     self.loop.on_image(camera, IMAGE, self.now - (self.apart if camera == "wrist" else 0.0))

@@ -6,25 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arm import ROBOT as PANDA
 from composing import CONF
 from defaults import defaults_of
 
 from vla.deploy.joint_limiter import JointLimiter, JointLimits
 
 PERIOD = 0.02
-ROBOT = JointLimits(
-    joints=["a", "b"],
-    low=[-1.0, -2.0],
-    high=[1.0, 2.0],
-    speed=[2.0, 1.0],
-    acceleration=[10.0, 5.0],
-    fingers=[],
-    finger_travel=0.04,
-    margin=0.05,
-    overshoot=0.01,
-    speed_share=0.5,
-    acceleration_share=0.5,
-)
+TWO = {"joints": ["a", "b"], "low": [-1.0, -2.0], "high": [1.0, 2.0], "speed": [2.0, 1.0], "acceleration": [10.0, 5.0]}
+ROBOT = replace(PANDA, **TWO, fingers=[], speed_share=0.5, acceleration_share=0.5)
 
 
 @pytest.fixture

@@ -33,11 +33,14 @@ from vla.tasks.libero.starts import Starts, set_start
 REFERENCE = Path(__file__).with_name("libero_reference.npz")  # of robosuite, by tools/libero/excerpt.py
 
 
+PLAIN = (  # small and plain pictures
+    *("task=libero", "task.image_size=[48,48]", "task.detail.things=300", "task.detail.robot=300"),
+    *("task.detail.rest=100", "task.detail.texels=32"),
+)
+
+
 def world(*overrides: str) -> Libero:
-    """A world with small and plain pictures."""
-    sizes = {"image_size": "[48,48]", "detail.things": 300, "detail.rest": 100, "detail.texels": 32}
-    plain = [f"task.{name}={value}" for name, value in sizes.items()]
-    made = Experiment.of(composed("task=libero", *plain, *overrides)).make_environment()()
+    made = Experiment.of(composed(*PLAIN, *overrides)).make_environment()()
     assert isinstance(made, Libero)
     return made
 
@@ -164,7 +167,7 @@ def test_pictures_are_mirrored_as_published() -> None:
 def test_the_planner_turns_on_the_stove_and_its_burner_lights_up() -> None:
     with closing(world("task.suite=goal", "task.tasks=[7]", "task.image_size=[96,96]")) as environment:
         before = environment.reset(3)
-        after = _solved(environment, 3)
+        after = solved(environment, 3)
     seen = [one.rgb["agentview"].astype(int) for one in (before, after)]
     dark, lit = (int(((picture[..., 0] - picture[..., 1]) > 80).sum()) for picture in seen)
     assert lit > dark + 20
@@ -174,10 +177,10 @@ def test_the_planner_turns_on_the_stove_and_its_burner_lights_up() -> None:
 def test_the_planner_solves(name: str) -> None:
     suite, number = name.split()
     with closing(world(f"task.suite={suite}", f"task.tasks=[{number}]")) as environment, environment.blind():
-        _solved(environment, 1)
+        solved(environment, 1)
 
 
-def _solved(environment: Libero, seed: int) -> Observation:
+def solved(environment: Libero, seed: int) -> Observation:
     expert, other = Planner(spec=environment.spec), Planner(spec=environment.spec)
     seen = environment.reset(seed)
     while not environment.done:

@@ -20,6 +20,7 @@ import pytest
 from command_line import here
 from composing import check, composed
 from PIL import Image, ImageOps
+from test_libero import PLAIN, solved, world
 from websockets.sync.server import ServerConnection, serve
 
 from vla.config.build import build
@@ -30,25 +31,14 @@ from vla.io.errors import UserError
 from vla.rollouts.evaluate import play_episode
 from vla.rollouts.remote import RemotePolicy
 from vla.spec import FIRST_SEED, Array
-from vla.tasks.libero.environment import Libero, action_of, command_of
+from vla.tasks.libero.environment import action_of, command_of
 from vla.tasks.libero.expert import Planner
 from vla.tasks.libero.package import CHANGES, SUITES, tasks_of
 
-PLAIN = [
-    *("task=libero", "task.image_size=[48,48]", "task.detail.things=300", "task.detail.robot=300"),
-    *("task.detail.rest=100", "task.detail.texels=32"),
-]
 ONE = [*PLAIN, "task.suite=object", "task.tasks=[0]"]
 CONDITIONS = ("positions", "objects", "sentences", "tasks")
 CLEAN = ("expert.perturb.noise=0", "expert.perturb.missed=0")
 QUIET = ("recorder=none", "cluster.workers=1", "logger=none")
-
-
-def world(*overrides: str) -> Libero:
-    """A world with small and plain pictures."""
-    made = Experiment.of(composed(*PLAIN, *overrides)).make_environment()()
-    assert isinstance(made, Libero)
-    return made
 
 
 def test_pictures_are_nearly_those_that_libero_hands_out(capsys: pytest.CaptureFixture[str]) -> None:
@@ -78,11 +68,8 @@ def test_libero_pro_changes_one_thing_at_a_time() -> None:
 def test_the_planner_plays_what_libero_pro_changes(name: str) -> None:
     suite, number = name.split()
     with closing(world(f"task.suite={suite}", f"task.tasks=[{number}]")) as environment, environment.blind():
-        expert, seen = Planner(spec=environment.spec), environment.reset(FIRST_SEED)
+        solved(environment, FIRST_SEED)
         assert environment.draws["start"]["official"] == 0
-        while not environment.done:
-            seen = environment.step(expert.act(seen))
-    assert environment.outcome == "success"
 
 
 def test_libero_pro_is_an_evaluation_with_a_paired_difference_per_change(tmp_path: Path) -> None:

@@ -11,8 +11,6 @@ import timm
 import torch
 from defaults import defaults_of
 from fake_batch import make_act, make_batch, make_bc, make_decoder, with_text
-from resuming import STOP, same
-from resuming import train as train_again
 from safetensors.torch import load_file, save_file
 from small_training import loader, make_learner, make_trainer
 from together import composed, train
@@ -159,20 +157,6 @@ def test_a_name_of_no_linear_map_is_told_with_those_there_are(module: str) -> No
     says = rf"lora\.modules names {module}, which no linear map .* called .*linear1, linear2.*, in .*decoder"
     with pytest.raises(UserError, match=says):
         make_learner(make_act(), lora=lora(module))
-
-
-def test_training_with_factors_goes_on_with_the_same_bits(folder: Path, tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    model = make_act()
-    lora("encoder", dropout=0.1).inject(model)
-    start = {name: value.clone() for name, value in model.state_dict().items()}
-    whole = train_again(model, folder, tmp_path / "whole")
-    model.load_state_dict(start)
-    train_again(model, folder, tmp_path / "half", STOP)
-    model.load_state_dict(start)
-    rest = train_again(model, folder, tmp_path / "rest", checkpoint=tmp_path / "half/checkpoints" / LAST)
-    for part in ("state_dict", "current_model_state", "optimizer_states"):
-        assert same(whole[part], rest[part]), part
 
 
 def test_a_configuration_chooses_the_factors_and_a_checkpoint_has_them(folder: Path, tmp_path: Path) -> None:

@@ -22,13 +22,11 @@ class Noting(toy.ToyExpert):
     """The toy expert, which keeps what it saw and heard."""
 
     def reset(self, instruction: str, seed: int) -> None:
-        """As the toy does."""
         super().reset(instruction, seed)
         self.seen: list[Observation] = []
         self.heard = instruction
 
     def act(self, observation: Observation) -> Array:
-        """As the toy does."""
         self.seen.append(observation)
         return super().act(observation)
 

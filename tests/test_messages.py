@@ -3,31 +3,20 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 from zlib import crc32
 
 import numpy as np
 import pytest
+from arm import ROBOT as PANDA
 from PIL import Image
 
 from vla.deploy import commands, messages
-from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.motion import Command
 
-ROBOT = JointLimits(
-    joints=["one", "two"],
-    low=[-1.0] * 2,
-    high=[2.0] * 2,
-    speed=[1.0] * 2,
-    acceleration=[1.0] * 2,
-    fingers=["left", "right"],
-    finger_travel=0.04,
-    margin=0.05,
-    overshoot=0.01,
-    speed_share=0.25,
-    acceleration_share=0.25,
-)
+ROBOT = replace(PANDA, joints=["one", "two"], low=[-1.0] * 2, high=[2.0] * 2, speed=[1.0] * 2, acceleration=[1.0] * 2)
 PIXELS = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)  # (H, W, 3)
 
 
@@ -88,9 +77,8 @@ def test_a_compressed_image_is_decoded(kind: str, mode: str) -> None:
         lambda whole: b"",
         lambda whole: whole[:-40],
         lambda whole: b"GIF89a" + whole,
-        lambda whole: (
-            whole[:33] + b"\0\0\0\3pHYs\0\0\1" + crc32(b"pHYs\0\0\1").to_bytes(4, "big") + whole[33:]
-        ),  # cut short
+        # Cut short.
+        lambda whole: whole[:33] + b"\0\0\0\3pHYs\0\0\1" + crc32(b"pHYs\0\0\1").to_bytes(4, "big") + whole[33:],
     ],
 )
 def test_a_compressed_image_that_is_none_is_refused(damage: Any) -> None:

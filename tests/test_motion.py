@@ -27,7 +27,6 @@ class Traced(toy.ToyEnvironment):
 
     @property
     def tool(self) -> Array:
-        """(3,) position."""
         return np.array([*self._point, 0.0])
 
 

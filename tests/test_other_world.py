@@ -10,15 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import toy
-from conftest import CONF
+from composing import composed
 from defaults import defaults_of
 from exporting import exporter
 from fake_batch import as_policy
-from hydra import compose, initialize_config_dir
-from lightning import Trainer
-from omegaconf import DictConfig
-from PIL import Image
 from rerun.chunk import RrdReader
+from small_training import make_trainer
 
 from vla.config.experiment import Experiment
 from vla.config.nodes import with_changes
@@ -29,8 +26,6 @@ from vla.policy import Policy
 from vla.reports.comparison_page import tabulate
 from vla.reports.dataset_card import store_table, write_card
 from vla.reports.evaluation import plot_report, write_report
-from vla.reports.observations import reset_panels
-from vla.reports.pictures import save
 from vla.reports.run_page import write_page
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.recorder import RerunRecorder
@@ -38,51 +33,21 @@ from vla.rollouts.recordings import merge_recordings
 from vla.runs.folder import save_config
 from vla.spec import FIRST_SEED
 
-TINY = {
-    "bc": ("model.width=16", "model.text_width=8", "model.keypoints=4"),
-    "rt1_tiny": (
-        "model.width=16",
-        "model.heads=2",
-        "model.layers=1",
-        "model.text_width=8",
-        "model.context.proprioception=true",
-    ),
-    "decoder": ("model.width=16", "model.heads=2", "model.layers=1", "model.text_width=8"),
-    "act": ("model.width=16", "model.heads=2", "model.text_width=8"),
-    "diffusion": ("model.width=16", "model.heads=2", "model.text_width=8"),
-    "flow": ("model.width=16", "model.heads=2", "model.text_width=8"),
-}
-
-
+SMALL = (
+    *("model=bc", "model.width=16", "model.text_width=8", "model.keypoints=4", "learner.warmup_steps=0"),
+    *("collect.episodes=30", "data.batch_size=4", "data.validation_fraction=0"),
+)
 OWN = {"expert": "clean", "evaluate": "generalisation"}
 
 
-def composed(model: str) -> DictConfig:
-    small = ("collect.episodes=30", "data.batch_size=4", "data.validation_fraction=0", "learner.warmup_steps=0")
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=["output=out", f"model={model}", *small, *TINY[model]])
-
-
-def policy_of(model: str, store: Path, environment: Any = None) -> Policy:
+def policy_of(store: Path, environment: Any = None) -> Policy:
     """A policy after two steps of training."""
-    experiment, opened = Experiment.of(composed(model)), EpisodeStore(store)
+    experiment, opened = Experiment.of(composed(*SMALL)), EpisodeStore(store)
     learner = experiment.fitted_learner(opened)
     network = learner.model
     data = experiment.data(opened, network.history, network.chunk, network.text.tokenize)
-    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
-    trainer = Trainer(accelerator="cpu", max_steps=2, enable_checkpointing=False, **quiet)  # type: ignore[arg-type]
-    trainer.fit(learner, datamodule=data)
+    make_trainer(2).fit(learner, datamodule=data)
     return as_policy(network, opened.spec)
-
-
-@pytest.mark.parametrize("model", TINY)
-def test_every_model_is_trained_and_acts_without_a_robot(folder: Path, model: str) -> None:
-    policy = policy_of(model, folder)
-    action = policy.act(toy.make_environment().reset(FIRST_SEED))
-    assert action.shape == (3,)
-    assert (np.array(toy.SPEC.low, np.float32) <= action).all() and (
-        action <= np.array(toy.SPEC.high, np.float32)
-    ).all()
 
 
 def test_a_policy_is_evaluated_recorded_and_reported(folder: Path, tmp_path: Path) -> None:
@@ -90,7 +55,7 @@ def test_a_policy_is_evaluated_recorded_and_reported(folder: Path, tmp_path: Pat
     (cell / ".hydra").mkdir(parents=True)
     (cell / ".hydra/overrides.yaml").write_text("- model=bc\n")
     seeds, recorder = range(FIRST_SEED, FIRST_SEED + 3), partial(RerunRecorder, cell / "recordings", 1)
-    report = evaluate(toy.make_environment, partial(policy_of, "bc", folder), recorder, seeds)
+    report = evaluate(toy.make_environment, partial(policy_of, folder), recorder, seeds)
     assert report.episodes == 3 and {*report.tasks} == {
         toy.make_environment().reset(seed).instruction.split()[3] for seed in seeds
     }
@@ -131,13 +96,6 @@ def test_a_store_is_verified_and_described(folder: Path) -> None:
     assert "east | m" in write_card(findings).read_text()
 
 
-def test_resets_are_shown(tmp_path: Path) -> None:
-    environment = toy.make_environment()
-    save(tmp_path / "sheet.png", reset_panels([0, 1], [environment.reset(seed) for seed in (0, 1)]), 2)
-    sheet = np.array(Image.open(tmp_path / "sheet.png").convert("RGB"), int)
-    assert (np.ptp(sheet, axis=-1) > 60).sum() > 1000  # pixels in colour, of which text has none
-
-
 def test_changes_are_merged_and_a_class_replaces_a_class() -> None:
     node: dict[str, Any] = {
         "size": 1,
@@ -159,9 +117,8 @@ def test_a_world_chooses_its_expert_and_evaluations_and_the_command_line_has_the
     (tmp_path / "task").mkdir()
     chosen = "".join(f"  - override /{group}@_global_.{group}: {name}\n" for group, name in OWN.items())
     (tmp_path / "task/other.yaml").write_text(f"defaults:\n  - _self_\n{chosen}\n_target_: somewhere.World\n")
-    there = [f"hydra.searchpath=[file://{tmp_path}]", "output=out", "task=other"]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        own, said = (compose("config", overrides=[*there, *more]) for more in ([], ["expert=waypoint"]))
+    there = (f"hydra.searchpath=[file://{tmp_path}]", "task=other")
+    own, said = composed(*there), composed(*there, "expert=waypoint")
     assert own.task == {"_target_": "somewhere.World"} and own.validate.changes == {}
     assert "perturb" not in own.expert and [*own.evaluate.conditions] == ["wide"]
     assert "perturb" in said.expert and [*said.evaluate.conditions] == ["wide"]

@@ -162,9 +162,7 @@ def test_each_stage_is_a_job_of_its_own(home: Path, importable: None) -> None:
 
 
 def test_its_demonstrations_are_described_replayed_and_exported(home: Path, importable: None) -> None:
-    shutil.copytree(
-        home / "episodes", home / "copy"
-    )  # the card that is written into it is none of the others' business
+    shutil.copytree(home / "episodes", home / "copy")  # whose card is none of the others' business
     replay = ("job=inspect", "inspect.folder=copy", "inspect.episode=0", "output=replay")
     assert "12 intact" in here(home, "job=inspect", "inspect.folder=copy").stdout
     assert "dx | m" in (home / "copy/card.md").read_text()

@@ -282,7 +282,6 @@ def test_what_makes_runs_differ_is_told(tmp_path: Path) -> None:
 
 
 def change(run: Path, edit: Callable[[dict[str, Any]], object]) -> None:
-    """Change the report of a run."""
     content = json.loads((run / "report.json").read_text())
     edit(content)
     (run / "report.json").write_text(json.dumps(content))
@@ -348,31 +347,3 @@ def test_the_page_of_a_sweep_leads_to_every_cell(tmp_path: Path) -> None:
     trainings = [dict(enumerate(won)) for won in ((True, True, True, True), (True, True, True, False))]
     low, high = (100 * bound for bound in pooled_interval(trainings))
     assert f"bc 87.5 ({low:.1f}-{high:.1f})" in told and markup.count("<svg") == 8
-
-
-ODD = {
-    "config.task": 5,
-    "config.task.tiers": {"easy": 5},
-    "config.evaluate": "y",
-    "config.evaluate.conditions": {"dark": [1]},
-    "config.evaluate.one_by_one": [1],
-    "config.evaluate.without": None,
-    "config.evaluate.networks": [1],
-    "per_episode": [],
-    "seeds": [FIRST_SEED] * 4,
-}
-
-
-@pytest.mark.parametrize("key", ODD)
-def test_a_report_of_odd_values_is_refused_by_their_name(key: str, tmp_path: Path) -> None:
-    runs = [a_run(tmp_path / name) for name in "ab"]
-    *parents, name = key.split(".")
-
-    def put(content: dict[str, Any]) -> None:
-        for parent in parents:
-            content = content[parent]
-        content[name] = ODD[key]
-
-    change(runs[0], put)
-    with pytest.raises(ValueError, match=rf"report\.json is damaged or of another kind: .*{re.escape(key)}"):
-        compared(runs, tmp_path / "page")

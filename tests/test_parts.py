@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import lightning
 import numpy as np
 import pytest
 import timm
@@ -19,7 +17,7 @@ from fake_batch import as_policy, make_batch
 from installed_package import NAME, digest, install, zipped_folder
 from safetensors.torch import save_file
 from saved_policies import change_json
-from small_training import loader
+from small_training import loader, make_trainer
 from tiny_encoder import sizes, write_encoder
 
 from vla import jobs
@@ -42,15 +40,7 @@ SMALL = ("task.image_size=[32,32]", "trainer=cpu", "recorder=none")
 def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy, Path]:
     """A policy after two steps on noise, and the checkpoint of it."""
     learner = Experiment.of(composed(*SMALL, *overrides)).learner(tabletop.spec)
-    trainer = lightning.Trainer(
-        accelerator="cpu",
-        max_steps=2,
-        callbacks=[EMA(0.9)],
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-    )
+    trainer = make_trainer(2, EMA(0.9))
     batch = make_batch(learner.model.history, learner.model.chunk, spec=tabletop.spec)
     trainer.fit(learner, loader(learner, [batch] * 2))
     trainer.strategy.checkpoint_io = AtomicCheckpointIO()
@@ -138,33 +128,25 @@ def test_a_checkpoint_brings_the_weights_that_its_training_started_from(tmp_path
     assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(observation), action)
 
 
-def unknown_name(folder: Path) -> list[str]:
-    return ["model/image=timm", "model.image.name=vit_smal_patch16_dinov3"]
-
-
-def no_folder(folder: Path) -> list[str]:
-    return ["model/text=huggingface", "model.text.name=/nowhere/at/all"]
-
-
-def wrong_weights(folder: Path) -> list[str]:
-    save_file(timm.create_model("test_resnet").state_dict(), folder / "weights.safetensors")
-    return ["model/image=timm", "model.image.name=test_vit", f"model.image.pretrained={folder}/weights.safetensors"]
-
-
 @pytest.mark.parametrize(
-    ("prepare", "message"),
+    ("overrides", "message"),
     [
-        (unknown_name, "did you mean vit_small_patch16_dinov3"),
-        (no_folder, "/nowhere/at/all cannot be fetched"),
-        (wrong_weights, "does not hold the weights of timm's test_vit"),
+        (["model/image=timm", "model.image.name=vit_smal_patch16_dinov3"], "did you mean vit_small_patch16_dinov3"),
+        (["model/text=huggingface", "model.text.name=/nowhere/at/all"], "/nowhere/at/all cannot be fetched"),
+        (
+            ["model/image=timm", "model.image.name=test_vit", "model.image.pretrained=FOLDER/weights.safetensors"],
+            "does not hold the weights of timm's test_vit",
+        ),
     ],
 )
 def test_what_cannot_be_built_is_named_before_anything_is_collected(
-    prepare: Callable[[Path], list[str]], message: str, tmp_path: Path
+    overrides: list[str], message: str, tmp_path: Path
 ) -> None:
-    overrides = [f"collect.folder={tmp_path}/store", f"output={tmp_path}/run", "job=train", *prepare(tmp_path)]
+    save_file(timm.create_model("test_resnet").state_dict(), tmp_path / "weights.safetensors")
+    there = (f"collect.folder={tmp_path}/store", f"output={tmp_path}/run", "job=train")
+    chosen = [override.replace("FOLDER", str(tmp_path)) for override in overrides]
     with pytest.raises(ValueError, match=message):
-        jobs.run(Experiment.of(composed(*SMALL, *overrides)))
+        jobs.run(Experiment.of(composed(*SMALL, *there, *chosen)))
     assert not (tmp_path / "store").exists()
 
 

@@ -46,7 +46,6 @@ class Counting:
         self.calls = 0
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Start counting."""
         self.calls = 0
 
     def act(self, observation: Observation) -> Array:
@@ -93,12 +92,8 @@ def test_a_schedule_tells_whose_action_is_due() -> None:
         (network_of(0.0), 4, 2, [1.00, 1.01, 2.00, 2.01, 3.00]),
         # 10 Hz: the second observation, at step 2, is answered at step 4, of which two actions are past by then.
         (network_of(0.2), 5, 2, [1.00, 1.01, 1.02, 1.03, 2.02, 2.03, 3.02]),
-        (
-            network_of(0.11),
-            5,
-            2,
-            [1.00, 1.01, 1.02, 1.03, 2.02, 2.03, 3.02],
-        ),  # an answer between steps is for the later
+        # An answer between steps is for the later one.
+        (network_of(0.11), 5, 2, [1.00, 1.01, 1.02, 1.03, 2.02, 2.03, 3.02]),
         # An arm without actions holds, and its plan does not age.
         (network_of(0.2), 1, 1, [1.00, 0, 0, 2.00, 0, 0, 3.00]),
         # Asked at step 2, out of actions at step 3 with one executed in between, answered at step 5.

@@ -19,20 +19,11 @@ from vla.models.model import Model
 from vla.models.recomputation import recompute_layers
 from vla.models.vision.timm_encoders import FilmBackbone
 
-
-def large_act() -> Model:
-    return make_act(width=64, layers=3)
-
-
-def frozen_vit() -> Model:
-    return make_bc(image=partial(FilmBackbone, "test_vit", False, frozen=False, size=32, channels=8))
-
-
 MODELS: dict[str, Callable[[], Any]] = {
-    "act": large_act,
+    "act": partial(make_act, width=64, layers=3),
     "rt1": partial(make_rt1, width=64, key_width=32, dropout=0.2),
     "decoder": partial(make_decoder, width=64, dropout=0.2),
-    "timm": frozen_vit,
+    "timm": partial(make_bc, image=partial(FilmBackbone, "test_vit", False, frozen=False, size=32, channels=8)),
     "transformers": make_trunk_model,
 }
 

@@ -18,6 +18,7 @@ from command_line import SMALL, here
 from exporting import exporter
 from fake_batch import as_policy, make_bc
 from finished_runs import compared
+from test_control_loop import World
 from test_server import serving
 
 from vla.config.build import build
@@ -315,11 +316,9 @@ class Behind:
         self.info: dict[str, Any] = {}
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Remember the episode."""
         self._seed = seed
 
     def act(self, observation: Observation) -> np.ndarray:
-        """Return the recorded action, as the state tells it, less some."""
         return observation.state + 1 - (1 + self._seed)
 
 
@@ -348,26 +347,17 @@ def test_joint_positions_in_degrees_move_a_robot_in_radians() -> None:
     spec = replace(SPEC, robot=RobotModel(NAMES, ""), control_hz=10.0)
     with pytest.raises(ValueError, match=r"deploy\.safety\.workspace cannot be kept by .* joint positions: set it to"):
         ControlLoop(spec, JOINTS, SAFETY, 50.0)
-    loop = ControlLoop(spec, JOINTS, replace(SAFETY, workspace=None), 50.0)
-    now, joints, seen, commands = 100.0, np.array([0.1, 0.2, 0.3]), [], []
-    goal = np.array([30.0, -45.0, 120.0])  # the last one is clipped to 90 degrees by the spec, and by the limits
-    for tick in range(150):
-        now += 0.02
-        loop.on_joint_state(joints, np.zeros(3), 0.0, now)
-        if tick == 5:
-            loop.on_instruction("move", now)
-        if tick % 5 == 0:
-            for camera in spec.cameras:
-                loop.on_image(camera, np.zeros((24, 32, 3), np.uint8), now)
-        if (observation := loop.next_observation(now)) is not None:
-            seen.append(observation.state)
-            loop.set_plan(goal[None].astype(np.float32))
-        command = loop.command(now)
-        assert command is not None
-        joints = command.position.copy()
-        commands.append(joints)
+    world, seen = World(), list[np.ndarray]()
+    world.loop = ControlLoop(spec, JOINTS, replace(SAFETY, workspace=None), 50.0)
+    world.joints, world.cameras = np.array([0.1, 0.2, 0.3]), [*spec.cameras]
+    goal = np.array([[30.0, -45.0, 120.0]], np.float32)  # the last one is clipped to 90 degrees, and by the limits
+    world.answer = lambda observation: (seen.append(observation.state), goal)[1]
+    held = world.run(0.1)
+    world.loop.on_instruction("move", world.now)
+    commands = [command.position for command in (*held, *world.run(2.9))]
+    assert len(commands) == 150
     np.testing.assert_allclose(seen[0], np.rad2deg([0.1, 0.2, 0.3]), rtol=1e-5)
-    np.testing.assert_allclose(joints, [np.pi / 6, -np.pi / 4, 1.45], atol=0.01)
+    np.testing.assert_allclose(commands[-1], [np.pi / 6, -np.pi / 4, 1.45], atol=0.01)
     assert np.abs(np.diff(commands, axis=0)).max() <= 2.0 * 0.02 + 1e-9
 
 

@@ -16,9 +16,8 @@ import moderngl
 import mujoco
 import numpy as np
 import pytest
-from conftest import CONF, make_tabletop
-from gallery import gallery
-from hydra import compose, initialize_config_dir
+from conftest import make_tabletop
+from gallery import compiled, gallery
 
 from vla import jobs
 from vla.config.compose import compose as compose_config
@@ -31,7 +30,7 @@ from vla.tasks.rendering import shapes
 from vla.tasks.rendering.context import Context
 from vla.tasks.rendering.fast import Detailed, Fast, FastRenderer
 from vla.tasks.rendering.reference import Reference, ReferenceRenderer
-from vla.tasks.rendering.renderer import Renderer, Views
+from vla.tasks.rendering.renderer import Renderer, RendererFactory, Views
 from vla.tasks.tabletop.environment import Tabletop
 
 SIZE = 64
@@ -53,6 +52,12 @@ def smooth(depth: Array) -> Array:
 def grey_levels(first: Array, second: Array) -> Array:
     """Return the mean difference of every picture."""
     return np.abs(first.astype(int) - second).mean(axis=(1, 2, 3))
+
+
+def drawn(choice: RendererFactory, model: mujoco.MjModel, data: mujoco.MjData, views: Views) -> tuple[Array, Array]:
+    """Return the pictures and depths that a renderer draws at once."""
+    with closing(choice.open(model, views)) as renderer:
+        return renderer.render(data)
 
 
 @pytest.fixture(scope="module")
@@ -96,17 +101,14 @@ def test_changes_of_a_model_are_taken_over(wide: tuple[Tabletop, Renderer, Refer
     environment, first, _ = wide
     for seed in (3, 50, 7):
         data = start(environment, seed, first)
-        new = fast().open(environment.simulation.compiled.model, Views((0, 1), SIZE, SIZE, geom_groups=(2,)))
-        for ours, theirs in zip(first.render(data), new.render(data), strict=True):
+        new = drawn(fast(), environment.simulation.compiled.model, data, Views((0, 1), SIZE, SIZE, geom_groups=(2,)))
+        for ours, theirs in zip(first.render(data), new, strict=True):
             np.testing.assert_array_equal(ours, theirs)
-        new.close()
 
 
 def test_geoms_come_and_go() -> None:
     text = '<mujoco><worldbody><geom size=".2" rgba="1 0 0 1"/><camera pos="0 0 1"/></worldbody></mujoco>'
-    model = mujoco.MjModel.from_xml_string(text)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+    model, data = compiled(text)
     renderer = fast().open(model, Views((0,), SIZE, SIZE))
     reds, depths = [], []
     for alpha in (1.0, 0.0, 0.5, 1.0):
@@ -125,8 +127,7 @@ def test_things_leave_and_enter_a_picture() -> None:
       </asset><worldbody><geom type="plane" size="1 1 .1" rgba="1 1 1 1"/><body mocap="true" pos="0 0 .3">
       <geom type="capsule" size=".1 .3" rgba="1 0 0 1"/></body><camera pos="0 -1 1" xyaxes="1 0 0 0 .7 .7" fovy="20"/>
       <camera pos="0 -3 1" xyaxes="1 0 0 0 0 1" projection="orthographic" fovy="2"/></worldbody></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(text)
-    data, view = mujoco.MjData(model), Views((0, 1), SIZE, SIZE)
+    (model, data), view = compiled(text), Views((0, 1), SIZE, SIZE)
     counts = []
     with closing(fast().open(model, view)) as first, closing(Reference().open(model, view)) as second:
         for x in (0.0, 0.25, 0.3, 0.95, 1.05, 9.0, 0.25):
@@ -149,10 +150,7 @@ def test_things_leave_and_enter_a_picture() -> None:
 def test_every_shape_texture_light_and_camera(lights: str, floor: str) -> None:
     model, data = gallery(lights, floor)
     view = Views(range(model.ncam), 96, 120, site_groups=(0,))
-    first, second = fast().open(model, view), Reference().open(model, view)
-    (rgb, depth), (reference, distance) = first.render(data), second.render(data)
-    first.close()
-    second.close()
+    (rgb, depth), (reference, distance) = (drawn(choice, model, data, view) for choice in (fast(), Reference()))
     for picture, other, near, far in zip(rgb, reference, depth, distance, strict=True):
         inside = smooth(near) & smooth(far)
         assert (np.abs(near - far)[inside] > 0.002).mean() < 0.002
@@ -165,8 +163,7 @@ def test_a_window_is_a_part_of_what_a_camera_sees(renderer: Fast | Reference) ->
     model, data = gallery("directional")
     cameras, top, left = range(model.ncam), [0, 12, 30, 60, 20], [10, 0, 45, 70, 20]
     parts = [slice(y, y + 60) for y in top], [slice(x, x + 50) for x in left]
-    with closing(renderer.open(model, Views(cameras, 120, 120))) as opened:
-        whole = opened.render(data)[0]
+    whole = drawn(renderer, model, data, Views(cameras, 120, 120))[0]
     expected = np.stack([picture[y, x] for picture, y, x in zip(whole, *parts, strict=True)])
     windows = np.array([[y / 120, x / 120, y / 120 + 0.5, x / 120 + 50 / 120] for y, x in zip(top, left, strict=True)])
     with closing(renderer.open(model, Views(cameras, 60, 50, aspect=1.0))) as opened:
@@ -204,14 +201,8 @@ def test_open_shapes_cast_shadows_with_both_sides() -> None:
       </asset><worldbody><light pos="0 0 3" dir="0 0 -1" type="directional"/><geom type="plane" size="3 3 .1"/>
       <geom type="mesh" mesh="lid" pos="0 0 1"/><camera pos="0 -3 .9" xyaxes="1 0 0 0 .3 1"/></worldbody></mujoco>"""
     for faces in ("0 1 4 1 2 4 2 3 4 3 0 4", "0 4 1 1 4 2 2 4 3 3 4 0"):
-        model = mujoco.MjModel.from_xml_string(text.replace("FACES", faces))
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        pictures = []
-        for choice in (fast(), Reference()):
-            renderer = choice.open(model, Views((0,), SIZE, SIZE))
-            pictures.append(renderer.render(data)[0])
-            renderer.close()
+        scene = compiled(text.replace("FACES", faces))
+        pictures = [drawn(choice, *scene, Views((0,), SIZE, SIZE))[0] for choice in (fast(), Reference())]
         below = [picture[0, SIZE // 2, SIZE // 2].astype(int) for picture in pictures]
         beside = [picture[0, -1, 0].astype(int) for picture in pictures]
         assert (below[0] < 0.7 * beside[0]).all()
@@ -220,16 +211,8 @@ def test_open_shapes_cast_shadows_with_both_sides() -> None:
 
 
 def test_edges_are_smooth_where_asked() -> None:
-    model, data = gallery("directional")
-    colours, views = {}, Views((0,), SIZE, SIZE)
-    for name, choice in {
-        "plain": fast(),
-        "smooth": fast(samples=4),
-        "soft": fast(soft=1),
-    }.items():
-        renderer = choice.open(model, views)
-        colours[name] = renderer.render(data)[0]
-        renderer.close()
+    scene, choices = gallery("directional"), {"plain": fast(), "smooth": fast(samples=4), "soft": fast(soft=1)}
+    colours = {name: drawn(choice, *scene, Views((0,), SIZE, SIZE))[0] for name, choice in choices.items()}
     for name in ("smooth", "soft"):
         assert 0 < grey_levels(colours["plain"], colours[name])[0] < 6, name
         shades = [len(np.unique(colours[each].reshape(-1, 3), axis=0)) for each in (name, "plain")]
@@ -243,14 +226,9 @@ def test_textures_are_as_coarse_as_mujocos_where_asked() -> None:
       <material name="skin" texture="skin"/></asset><worldbody>
       <geom type="plane" size="1 1 .1" material="skin"/><camera pos="0 -1.5 1" xyaxes="1 0 0 0 .55 .83"/>
       </worldbody></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(text)
-    data, drawn = mujoco.MjData(model), {}
-    mujoco.mj_forward(model, data)
-    for name, choice in {"mujoco": Reference(), "smooth": fast(samples=4), "detailed": Detailed()}.items():
-        renderer = choice.open(model, Views((0,), SIZE, SIZE))
-        drawn[name] = renderer.render(data)[0]
-        renderer.close()
-    smooth, detailed = (grey_levels(drawn["mujoco"], drawn[name])[0] for name in ("smooth", "detailed"))
+    scene, views = compiled(text), Views((0,), SIZE, SIZE)
+    mujocos, *ours = (drawn(choice, *scene, views)[0] for choice in (Reference(), fast(samples=4), Detailed()))
+    smooth, detailed = (grey_levels(mujocos, pictures)[0] for pictures in ours)
     assert detailed < 0.8 * smooth
 
 
@@ -258,8 +236,7 @@ def test_renderers_share_a_context_and_draw_by_turns() -> None:
     scenes, alone = [], []
     for lights, settings in (("spot", {}), ("directional", {"samples": 4}), ("several", {"soft": 1})):
         model, data = gallery(lights)
-        with closing(fast(**settings).open(model, Views((0,), SIZE, SIZE))) as renderer:
-            alone.append(renderer.render(data)[0])
+        alone.append(drawn(fast(**settings), model, data, Views((0,), SIZE, SIZE))[0])
         scenes.append((settings, model, data))
     renderers = [fast(**settings).open(model, Views((0,), SIZE, SIZE)) for settings, model, _ in scenes]
     with ThreadPoolExecutor() as pool:
@@ -271,21 +248,6 @@ def test_renderers_share_a_context_and_draw_by_turns() -> None:
                 assert np.array_equal(pool.submit(renderer.render, data).result()[0], expected)
     for renderer in renderers[:2]:
         renderer.close()
-
-
-def test_a_store_belongs_to_a_renderer() -> None:
-    folders, names = zip(*(collected_with(renderer) for renderer in ("fast", "mujoco")), strict=True)
-    assert len(set(folders)) == 2
-    assert [name.rpartition(".")[2] for name in names] == ["Fast", "Reference"]
-
-
-def collected_with(renderer: str) -> tuple[str, str]:
-    """Return the folder of the store and the class of the renderer, which its header tells."""
-    import vla.config.resolvers  # noqa: F401  registers them
-
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", overrides=[f"task/renderer={renderer}"])
-    return config.collect.folder, config.task.renderer._target_
 
 
 def test_what_is_left_out_is_named(caplog: pytest.LogCaptureFixture) -> None:
@@ -314,7 +276,8 @@ def test_without_egl_mujocos_renderer_is_chosen_and_named(
     usable = compose_config("output=here", *others)
     assert "the fast renderer needs EGL, which this machine lacks" in caplog.text
     assert "task/renderer=mujoco instead" in caplog.text
-    assert usable.collect.folder == collected_with("mujoco")[0] != collected_with("fast")[0]
+    folders = [compose_config("output=here", f"task/renderer={each}").collect.folder for each in ("mujoco", "fast")]
+    assert usable.collect.folder == folders[0] != folders[1]
     assert not substitutes(plain(config.task), ["task/renderer=fast"])  # and fails, in a sentence
     monkeypatch.setenv(gl.EGL_WORKS, "True")
     assert not substitutes(plain(config.task), [])
@@ -409,9 +372,8 @@ def test_a_heavy_mesh_is_decimated_once_and_keeps_its_texture(tmp_path: Path, mo
       <material name="skin" texture="skin" texrepeat="4 3"/></asset><worldbody>
       <geom type="mesh" mesh="ball" material="skin"/><camera pos="3 0 0" xyaxes="0 1 0 0 0 1"/>
       <camera pos="-3 0 0" xyaxes="0 -1 0 0 0 1"/></worldbody></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(text, {"ball.obj": textured_ball(60, 90).encode()})
-    data, views = mujoco.MjData(model), Views((0, 1), 128, 128)  # the first camera sees the seam
-    mujoco.mj_forward(model, data)
+    model, data = compiled(text, {"ball.obj": textured_ball(60, 90).encode()})
+    views = Views((0, 1), 128, 128)  # the first camera sees the seam
 
     def pictures(choice: Fast | Reference) -> Array:
         with closing(choice.open(model, views)) as renderer:

@@ -11,6 +11,7 @@ import pytest
 from figures import bars
 from matplotlib.figure import Figure
 from PIL import Image
+from toy import ToyEnvironment
 from toy_recordable import make_environment
 
 from vla.reports.evaluation import plot_report, write_report
@@ -83,15 +84,19 @@ def test_texts_of_a_page_are_left_to_the_fonts_of_the_browser(tmp_path: Path) ->
         save(tmp_path / "title.png", {chinese: lambda axes: axes.axis("off")}, 1)
 
 
-def test_a_contact_sheet_shows_the_observations(tmp_path: Path, figures: list[Figure]) -> None:
-    environment, seeds = make_environment(), [FIRST_SEED, FIRST_SEED + 1, FIRST_SEED + 2]
+@pytest.mark.parametrize("environment", [make_environment(), ToyEnvironment()], ids=["depth", "colour alone"])
+def test_a_contact_sheet_shows_the_observations(
+    environment: ToyEnvironment, tmp_path: Path, figures: list[Figure]
+) -> None:
+    seeds = [FIRST_SEED, FIRST_SEED + 1, FIRST_SEED + 2]
     observations = [environment.reset(seed) for seed in seeds]
     save(tmp_path / "sheet.png", reset_panels(seeds, observations), 2)
     for seed, seen, axes in zip(seeds, observations, figures[0].axes, strict=True):
         assert axes.get_title() == f"seed {seed}: {seen.instruction}"
         shown = np.asarray(axes.images[0].get_array())
         images = np.concatenate([*seen.rgb.values()], axis=1)
-        assert np.array_equal(shown[:, : images.shape[1]], images) and shown.shape[1] > images.shape[1]  # and depth
+        assert np.array_equal(shown[:, : images.shape[1]], images)
+        assert (shown.shape[1] > images.shape[1]) == bool(seen.depth)
 
 
 def test_draws_table_tells_ranges_and_words() -> None:

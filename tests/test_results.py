@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
@@ -10,16 +11,37 @@ from typing import Any
 
 import pytest
 from finished_runs import CONFIG, a_run, compared
+from hostile import put
 
 from vla.runs.files import Change, Training
 from vla.runs.folder import read_run, save_training
+from vla.spec import FIRST_SEED
 
 BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
 
 
-def changed(**values: Any) -> Callable[[str], str]:
-    """What makes another text of a JSON object: some of its values changed."""
-    return lambda text: json.dumps({**json.loads(text), **values})
+def changed(key: str, value: Any) -> Callable[[str], str]:
+    """What makes another text of a JSON object: the value at a key with dots is changed."""
+
+    def change(text: str) -> str:
+        content = json.loads(text)
+        put(content, key, value)
+        return json.dumps(content)
+
+    return change
+
+
+ODD = {
+    "config.task": 5,
+    "config.task.tiers": {"easy": 5},
+    "config.evaluate": "y",
+    "config.evaluate.conditions": {"dark": [1]},
+    "config.evaluate.one_by_one": [1],
+    "config.evaluate.without": None,
+    "config.evaluate.networks": [1],
+    "per_episode": [],
+    "seeds": [FIRST_SEED] * 4,
+}
 
 
 def test_what_was_written_is_read(tmp_path: Path) -> None:
@@ -39,16 +61,17 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     [
         ("report.json", "{", r"report\.json is damaged or of another kind: .*JSON"),
         ("report.json", "[" * 10**6, r"report\.json is damaged .*recursion limit"),
-        ("report.json", changed(latency_ms=float("nan")), r"latency_ms: Input should be a finite number"),
-        ("report.json", changed(seeds=[1]), r"per_episode has other episodes than seeds"),
-        ("report.json", changed(conditions={"dark": 3}), r"conditions\.dark: "),
+        ("report.json", changed("latency_ms", float("nan")), r"latency_ms: Input should be a finite number"),
+        ("report.json", changed("seeds", [1]), r"per_episode has other episodes than seeds"),
+        ("report.json", changed("conditions", {"dark": 3}), r"conditions\.dark: "),
+        *(("report.json", changed(key, value), rf"another kind: .*{re.escape(key)}") for key, value in ODD.items()),
         ("config.yaml", "- 1", r"config\.yaml is damaged or of another kind: Input should be an object"),
         ("config.yaml", BOMB, r"config\.yaml is nested deeper than \d+ levels, or has aliases"),
         ("config.yaml", "# " + "x" * (2 << 20), r"config\.yaml has \d+ bytes, more than"),
         ("config.yaml", "a: !!python/object/apply:os.getcwd []", r"config\.yaml is no plain YAML"),
         ("changes.yaml", "- {key: 1, here: 2}", r"\[0\]\.key: .*; \[0\]\.default: Field required"),
         ("training.json", "{}", r"parameters: Field required"),
-        ("training.json", changed(checkpoint="../../other"), r"checkpoint: Unexpected keyword"),
+        ("training.json", changed("checkpoint", "../../other"), r"checkpoint: Unexpected keyword"),
         ("metrics.csv", "epoch,train/loss\n0,1\n", r"metrics\.csv is damaged in line 1: there is no column step"),
         ("metrics.csv", "step,train/loss\n9,1\nten,2\n", r"metrics\.csv is damaged in line 3: .*'ten'"),
         ("metrics.csv", "step,train/loss\n9,1,2\n", r"line 2: .*longer"),

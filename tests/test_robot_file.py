@@ -31,6 +31,7 @@ from command_line import here
 from composing import composed
 from conftest import make_tabletop
 from defaults import defaults_of
+from test_control_loop import World
 
 from vla.config.build import require_no_paths
 from vla.config.experiment import plain
@@ -211,20 +212,13 @@ def test_a_cartesian_policy_moves_the_arm_that_it_was_trained_with(jaco: Tableto
     robot = JointLimits(
         **defaults_of("deploy/robot/simulated", joints=list(spec.require_robot("this").joints), **limits, **shares)
     )
-    loop = ControlLoop(spec, robot, replace(SAFETY, workspace=((-2.0,) * 3, (2.0,) * 3)), 50.0)
-    now, joints = 100.0, arm.home.copy()
-    start = arm.forward(joints)[0].copy()
-    loop.on_instruction("move", now)
-    for tick in range(100):
-        now += 0.02
-        loop.on_joint_state(joints, np.zeros(6), 0.08, now)
-        if tick % 5 == 0:
-            loop.on_image("front", np.zeros((*spec.image_size, 3), np.uint8), now)
-        if loop.next_observation(now) is not None:
-            loop.set_plan(np.array([[0.0, 0.005, 0, 0, 0, 0, 1]], np.float32))
-        if (command := loop.command(now)) is not None:
-            joints = command.position
-    moved = arm.forward(joints)[0]
+    world, start = World(), arm.forward(arm.home)[0].copy()
+    world.loop = ControlLoop(spec, robot, replace(SAFETY, workspace=((-2.0,) * 3, (2.0,) * 3)), 50.0)
+    world.joints, world.cameras = arm.home.copy(), ["front"]
+    world.answer = lambda observation: np.array([[0.0, 0.005, 0, 0, 0, 0, 1]], np.float32)
+    world.loop.on_instruction("move", world.now)
+    world.run(2.0)
+    moved = arm.forward(world.joints)[0]
     assert moved[1, 3] - start[1, 3] > 0.05
     np.testing.assert_allclose(moved[[0, 2], 3], start[[0, 2], 3], atol=3e-3)
     np.testing.assert_allclose(moved[:3, :3], start[:3, :3], atol=0.02)

@@ -113,14 +113,8 @@ def test_the_tokens_of_the_cameras_stand_side_by_side(cameras: tuple[str, ...]) 
     image = partial(FilmEfficientNet, "efficientnet_b0", pretrained=False, channels=16)
     spec = replace(SPEC, cameras=cameras)
     tokenizer = RT1Bins(spec=spec, **defaults_of("tokenizer/rt1"))
-    model = RT1(
-        image=image,
-        text=TINY_TEXT,
-        spec=spec,
-        tokenizer=tokenizer,
-        context=context_of("model/rt1", history=2),
-        **defaults_of("model/rt1", image_size=(64, 64), width=32, text_width=8, layers=1, heads=1),
-    ).eval()
+    sizes = {"history": 2, "learned_tokens": 8, "keypoints": 0, "image_size": (64, 64), "layers": 1, "heads": 1}
+    model = make_rt1(image=image, spec=spec, tokenizer=tokenizer, **sizes).eval()
     batch = with_text(model, make_batch(2, spec=spec))
     assert model.encode(batch).shape == (4, 2, 8 * len(cameras), 32)
     assert model(batch)["logits"].shape == (4, 2, 1, 3, 256)

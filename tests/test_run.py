@@ -336,11 +336,8 @@ def test_a_store_is_chosen_from_another_and_its_damage_is_named(home: Path, tmp_
     with open(tmp_path / "few/rgb_front.bin", "r+b") as file:
         file.truncate(file.seek(0, os.SEEK_END) - 1)
     done = here(home, "job=inspect", f"inspect.folder={tmp_path}/few", ok=False)
-    assert (
-        f"{len(seeds) - 1} intact" in done.stdout
-        and "1 damaged episodes" in done.stderr
-        and "Traceback" not in done.stderr
-    )
+    assert f"{len(seeds) - 1} intact" in done.stdout
+    assert "1 damaged episodes" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_an_episode_is_replayed_into_a_recording(home: Path) -> None:
@@ -361,14 +358,6 @@ def test_a_damaged_checkpoint_is_named(home: Path) -> None:
     done = here(home, "checkpoint=damaged", "output=cut", ok=False)
     assert re.fullmatch(r"error: damaged/model\.safetensors is damaged.*\n", done.stderr)
     assert not (home / "cut").exists()
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 1
-    weights.write_bytes(flipped)
-    with pytest.raises(ValueError, match="is damaged, or not the file"):
-        read_policy(home / "damaged").state  # noqa: B018
-    done = here(home, "checkpoint=run/checkpoints/last.ckpt", "output=cut", ok=False)
-    assert "last.ckpt only resumes its own training: a policy is a folder" in done.stderr
-    assert done.stderr.endswith("the run that has it, run\n")
 
 
 def test_a_bug_gives_a_traceback_and_so_does_a_mistake_where_asked(
@@ -406,9 +395,8 @@ def test_a_policy_is_trained_further_for_another_goal(home: Path, tmp_path: Path
     before, after = map(read_policy, (tmp_path / "theirs", home / "tuned"))
     assert after.config["task"]["goal"] != before.config["task"]["goal"]
     for name, weight in before.state.items():
-        gathered = name.startswith(
-            ("features.proprioception.", "truth_scale.")
-        )  # statistics, of all that was ever seen
+        # Statistics are of all that was ever seen.
+        gathered = name.startswith(("features.proprioception.", "truth_scale."))
         assert gathered or torch.allclose(after.state[name], weight, atol=1e-9), name
     for other in ("model=rt1_tiny", "tokenizer.bins=64", "model.shift=[0,0]"):
         refused = here(home, *arguments, other, ok=False)

@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 from command_line import SMALL, here
 from composing import composed
+from defaults import defaults_of
 from fake_batch import as_policy, make_act, make_bc, make_denoising, make_rt1
 from toy import SPEC, ToyEnvironment
 from websockets.datastructures import Headers
@@ -51,19 +52,9 @@ KEYS = Keys({"eye": "observation/image"}, ["observation/state"], "prompt")
 
 
 def settings(policy: Policy, **changes: Any) -> PolicyServer:
-    values: dict[str, Any] = {
-        "host": "127.0.0.1",
-        "port": 0,
-        "keys": KEYS,
-        "connections": 4,
-        "largest_message": 1_000_000,
-        "api_key": None,
-        "origins": [],
-        "policy": lambda: policy,
-        "environment": ToyEnvironment,
-        "output": Path(),
-    }
-    return PolicyServer(**{**values, **changes})
+    own = {"port": 0, "keys": KEYS, "connections": 4, "largest_message": 1_000_000, "api_key": None}
+    parts: dict[str, Any] = {"policy": lambda: policy, "environment": ToyEnvironment, "output": Path()}
+    return PolicyServer(**defaults_of("deploy/server", **{**own, **changes}), **parts)
 
 
 def serving(policy: Policy, **changes: Any) -> AbstractContextManager[str]:
@@ -95,22 +86,8 @@ def observations(count: int, seed: int = 0) -> list[Observation]:
 
 
 def remote(url: str, **changes: Any) -> RemotePolicy:
-    values: dict[str, Any] = {
-        "url": url,
-        "images": {"eye": "observation/image", "other": "observation/other"},
-        "channels_first": False,
-        "image_size": None,
-        "state": {"observation/state": None},
-        "prompt": "prompt",
-        "actions": None,
-        "execute": None,
-        "asynchronous": False,
-        "ensemble": None,
-        "timeout": 10.0,
-        "api_key": None,
-        "spec": SPEC,
-    }
-    return RemotePolicy(**{**values, **changes})
+    own = {"images": {"eye": "observation/image", "other": "observation/other"}, "timeout": 10.0, "api_key": None}
+    return RemotePolicy(**defaults_of("agent/remote", url=url, **{**own, "spec": SPEC, **changes}))
 
 
 def before_plans(policy: Policy, monkeypatch: pytest.MonkeyPatch, do: Callable[[int], object]) -> None:

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_batch import as_policy, make_act, make_bc, make_denoising, make_rt1
-from toy import SPEC, ToyEnvironment
-from toy_telling import Telling
+from toy import SPEC, Telling, ToyEnvironment
 
 from vla.models.flow import Flow
 from vla.models.model import Model

@@ -27,17 +27,13 @@ def compared(first: str, second: str) -> Comparison:
     return compare_conditions({"seen": a_report(first), "dark": a_report(second)}, 0.02)["dark"][SUCCESS]
 
 
-def p_value(first: str, second: str) -> float:
-    return compared(first, second).p
-
-
 def test_only_pairs_that_differ_count() -> None:
     # one lost, five won: 2 · (1 + 6) / 2^6
-    assert p_value("1000001111", "0111111111") == pytest.approx(14 / 64)
-    assert p_value("1100", "1100") == 1.0
-    assert p_value("1e00", "1000") == 1.0
+    assert compared("1000001111", "0111111111").p == pytest.approx(14 / 64)
+    assert compared("1100", "1100").p == 1.0
+    assert compared("1e00", "1000").p == 1.0
     # ten lost, none won: 2 / 2^10
-    assert p_value("1" * 10, "0" * 10) == pytest.approx(2 / 1024)
+    assert compared("1" * 10, "0" * 10).p == pytest.approx(2 / 1024)
     told = compared("1100e", "10101")
     assert (told.difference, told.episodes, told.only_first, told.only_second) == (0, 4, 1, 1)
 

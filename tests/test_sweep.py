@@ -60,7 +60,6 @@ def test_worlds_are_the_same_whether_a_condition_makes_them_or_the_task_is_so(tm
 
 
 def printed(table: Table) -> str:
-    """The table as text."""
     console = Console(file=io.StringIO(), width=120, record=True)
     console.print(table)
     return console.export_text()

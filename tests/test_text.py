@@ -14,7 +14,6 @@ from defaults import defaults_of
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from vla.config.build import check_node
 from vla.config.compose import axes
 from vla.io.errors import UserError
 from vla.models.text.colours import in_basic_terms
@@ -167,10 +166,3 @@ def test_sentences_go_without_a_share_of_their_parts_in_training_only(option: st
     assert not torch.equal(encoder(tokens), encoder(tokens))
     encoder.eval()
     assert torch.equal(encoder(tokens), encoder(tokens))
-
-
-def test_n_grams_are_short() -> None:
-    """Over the lengths up to 2^31, which a checkpoint could ask for, a single sentence took minutes."""
-    node: Any = OmegaConf.to_container(OmegaConf.load(CONF / "model/text/ngrams.yaml"))
-    with pytest.raises(ValueError, match=r"text\.words must be (greater|less) than or equal to 1"):
-        check_node("text", {**node, "words": 2**31 - 1}, object)

@@ -16,6 +16,7 @@ import lightning
 import pytest
 import torch
 import toy
+from defaults import defaults_of
 from fake_batch import as_policy, make_act, make_batch, make_bc, make_denoising, make_rt1
 from omegaconf import OmegaConf
 from resuming import STEPS, STOP, VALIDATED, same, train
@@ -23,6 +24,7 @@ from small_training import fit, make_learner
 
 from vla.io.errors import UserError
 from vla.models.diffusion import Diffusion
+from vla.models.lora import LoRA
 from vla.models.model import Model
 from vla.spec import FIRST_SEED, Array, Observation
 from vla.training.checkpoints import SAVE_EVERY, GracefulStop
@@ -30,12 +32,27 @@ from vla.training.closed_loop import ClosedLoop
 from vla.training.throughput import TrainingProgressBar
 from vla.training.trainer import explain_memory_errors
 
+
+def with_factors() -> Model:
+    """An ACT with low-rank factors, which draw as well."""
+    model, options = make_act(), {"rank": 4, "alpha": 8.0, "modules": ("encoder",), "dropout": 0.1}
+    LoRA(**defaults_of("learner/lora/low_rank", **options)).inject(model)
+    return model
+
+
 MODELS: dict[str, Callable[[], Model]] = {
     "bc": lambda: make_bc(shift=(64, 64)),
     "rt1 with dropout": lambda: make_rt1(dropout=0.2),
     "act, which draws": make_act,
+    "factors": with_factors,
     "diffusion, which draws": lambda: make_denoising(Diffusion),
 }
+
+
+def loaded(model: Model, state: dict[str, Any]) -> Model:
+    """The model, with these weights."""
+    model.load_state_dict(state)
+    return model
 
 
 def logged(output: Path) -> list[dict[str, str]]:
@@ -49,14 +66,8 @@ def logged(output: Path) -> list[dict[str, str]]:
 def test_going_on_after_an_interruption_gives_the_same_bits(name: str, folder: Path, tmp_path: Path) -> None:
     torch.manual_seed(0)
     start = MODELS[name]().state_dict()
-
-    def fresh() -> Model:
-        model = MODELS[name]()
-        model.load_state_dict(start)
-        return model
-
-    whole = train(fresh(), folder, tmp_path / "whole")
-    half = train(fresh(), folder, tmp_path / "half", stop=STOP)
+    whole = train(loaded(MODELS[name](), start), folder, tmp_path / "whole")
+    half = train(loaded(MODELS[name](), start), folder, tmp_path / "half", stop=STOP)
     assert half["global_step"] == STOP and not half["finished"] and whole["finished"]
     last = tmp_path / "half/checkpoints/last.ckpt"
     torch.save({**half, "seconds": 1000.0}, last)
@@ -84,19 +95,13 @@ def test_resuming_at_a_validation_step_keeps_its_validation(
     killed: bool, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     start = make_bc().state_dict()
-
-    def fresh() -> Model:
-        model = make_bc()
-        model.load_state_dict(start)
-        return model
-
-    train(fresh(), folder, tmp_path / "whole")
+    train(loaded(make_bc(), start), folder, tmp_path / "whole")
     if killed:
         monkeypatch.setattr("vla.training.checkpoints.SAVE_EVERY", VALIDATED)
         with pytest.raises(RuntimeError, match="killed"):
-            train(fresh(), folder, tmp_path / "half", killer=DieAt(VALIDATED + 1))
+            train(loaded(make_bc(), start), folder, tmp_path / "half", killer=DieAt(VALIDATED + 1))
     else:
-        train(fresh(), folder, tmp_path / "half", stop=VALIDATED)
+        train(loaded(make_bc(), start), folder, tmp_path / "half", stop=VALIDATED)
     last = tmp_path / "half/checkpoints/last.ckpt"
     assert torch.load(last, weights_only=True)["global_step"] == VALIDATED
     train(make_bc(), folder, tmp_path / "half", checkpoint=last)
@@ -111,11 +116,9 @@ def test_a_policy_has_the_figures_of_a_validation_before_the_interruption(folder
 
 def test_gradients_that_are_gathered_over_batches_are_not_cut_in_half(folder: Path, tmp_path: Path) -> None:
     torch.manual_seed(0)
-    model = make_bc()
-    start = {name: value.clone() for name, value in model.state_dict().items()}
-    whole = train(model, folder, tmp_path / "whole", accumulate_grad_batches=3)
-    model.load_state_dict(start)
-    half = train(model, folder, tmp_path / "half", stop=STOP, accumulate_grad_batches=3)
+    start = make_bc().state_dict()
+    whole = train(loaded(make_bc(), start), folder, tmp_path / "whole", accumulate_grad_batches=3)
+    half = train(loaded(make_bc(), start), folder, tmp_path / "half", stop=STOP, accumulate_grad_batches=3)
     assert half["global_step"] == STOP
     checkpoint = tmp_path / "half/checkpoints/last.ckpt"
     rest = train(make_bc(), folder, tmp_path / "rest", checkpoint=checkpoint, accumulate_grad_batches=3)
@@ -235,16 +238,6 @@ def test_between_validations_no_environment_is_held(folder: Path, tmp_path: Path
     assert len(held) >= 4 and held == [1, -1] * (len(held) // 2)
 
 
-class Ending(toy.ToyEnvironment):
-    """Tells where an episode ended, to the last bit."""
-
-    def step(self, action: Array) -> Observation:
-        """Move the point."""
-        observation = super().step(action)
-        self.draws["end"] = self._point
-        return observation
-
-
 @pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])
 def test_validation_finds_the_same_with_any_number_of_workers(
     make: Callable[[], Model], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -253,7 +246,7 @@ def test_validation_finds_the_same_with_any_number_of_workers(
     torch.backends.cuda.enable_flash_sdp(True)  # as in a new process, whatever an interrupted training before left
     learner.on_fit_start()  # what a training sets must not matter
     try:
-        with ClosedLoop(Ending, as_policy, seeds, tmp_path, workers=2) as closed_loop:
+        with ClosedLoop(toy.Telling, as_policy, seeds, tmp_path, workers=2) as closed_loop:
             with monkeypatch.context() as changed:
                 changed.setattr("vla.training.closed_loop.memory_of", lambda device: (0.0, 1e4))  # for no other model
                 alone = closed_loop.play(learner, seeds, 2)
@@ -265,7 +258,7 @@ def test_validation_finds_the_same_with_any_number_of_workers(
     finally:
         learner.teardown("fit")
     by_seed = sorted(shared, key=lambda result: result.seed)
-    assert by_seed == alone and all(result.draws["end"] for result in alone)
+    assert by_seed == alone and all(result.draws["done"] for result in alone)
     assert sorted(negated, key=lambda result: result.seed) == again != alone
     assert not active_children()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
@@ -21,7 +20,6 @@ from small_training import CONFIG, loader, make_trainer
 from tiny_vla import (
     CHUNK,
     KEYPOINTS,
-    REFERENCE,
     SENTENCES,
     SMOLVLA,
     SPEC,
@@ -37,13 +35,11 @@ from tiny_vla import (
     write_tokenizer,
 )
 
-from vla.config.compose import compose
 from vla.io.errors import UserError
 from vla.models.learner import Learner
 from vla.models.lora import LoRA
 from vla.models.policy_folder import read_policy
 from vla.models.vlm.lerobot_export import LeRobotPolicyExporter
-from vla.models.vlm.network import renamed
 from vla.models.vlm.normalizer import Normalizer
 from vla.models.vlm.policy import resize_with_padding
 from vla.models.vlm.prompt import PADDING, WORDS, Prompt
@@ -103,22 +99,6 @@ def test_a_missing_camera_and_padding_have_no_effect() -> None:
         assert torch.equal(network.velocity(whole, noisy, each), velocity)
         later = torch.cat([noisy[:, :-1], noisy[:, -1:] + 1], 1)
         assert torch.equal(network.velocity(whole, later, time)[:, :-1], velocity[:, :-1])
-
-
-def test_published_names_and_shapes_are_those_of_the_network() -> None:
-    listed = json.loads((REFERENCE / "smolvla_base.json").read_text())
-    shapes = dict[str, list[int]]()
-    for name, layers, shape in listed["weights"]:
-        for number in range(*map(int, layers.split(":"))) if layers else [0]:
-            shapes[name.replace("*", str(number))] = shape
-    assert len(shapes) == listed["tensors"] and sum(map(math.prod, shapes.values())) == listed["numbers"]
-    arguments = {name: value for name, value in compose("model=smolvla").model.network.items() if name[0] != "_"}
-    with torch.device("meta"):
-        network = SmolVLA(**arguments)
-    ours = {name: [*weight.shape] for name, weight in network.named_parameters()}
-    used = {name: shape for name, shape in shapes.items() if not name.startswith(network.unused)}
-    assert {renamed(name, network.published): shape for name, shape in used.items()} == ours
-    assert shapes.keys() - used.keys() == {"model.vlm_with_expert.vlm.lm_head.weight"}
 
 
 @pytest.mark.parametrize("kind", ["mean_std", "quantiles"])
@@ -239,7 +219,7 @@ def test_training_and_planning_compile_as_one_graph_each() -> None:
     assert deviation(compiled(batch)["loss"].detach(), model.loss(batch)["loss"].detach()) < 1e-5
 
 
-def written(folder: Path, tokenizer: Path, change: Callable[[dict[str, Any]], None] | None = None) -> Path:
+def written(folder: Path, tokenizer: Path, change: Callable[[dict[str, Any]], object] | None = None) -> Path:
     """A published policy of random weights."""
     model = make_smolvla(tokenizer)
     LeRobotPolicyExporter(folder).export(as_policy(model, SPEC))
@@ -334,24 +314,12 @@ def test_a_trunk_alone_leaves_the_expert_random(tmp_path: Path) -> None:
         assert model.predict(with_text(model, make_batch(1, CHUNK, spec=SPEC))).actions.isfinite().all()
 
 
-def _drop(weights: dict[str, Any]) -> None:
-    del weights["model.state_proj.bias"]
-
-
-def _add(weights: dict[str, Any]) -> None:
-    weights["model.other.bias"] = torch.zeros(1)
-
-
-def _resize(weights: dict[str, Any]) -> None:
-    weights["model.state_proj.bias"] = torch.zeros(5)
-
-
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (_drop, "lacks state_proj.bias"),
-        (_add, "has model.other.bias, which the model lacks"),
-        (_resize, "model.state_proj.bias in .* has the shape"),
+        (lambda w: w.pop("model.state_proj.bias"), "lacks state_proj.bias"),
+        (lambda w: w.update({"model.other.bias": torch.zeros(1)}), "has model.other.bias, which the model lacks"),
+        (lambda w: w.update({"model.state_proj.bias": torch.zeros(5)}), "model.state_proj.bias in .* has the shape"),
     ],
 )
 def test_other_weights_are_refused(tmp_path: Path, tokenizer: Path, change: Any, sentence: str) -> None:

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 from fake_batch import as_policy, make_act, make_bc, make_denoising, make_rt1
-from toy import ToyEnvironment, ToyExpert, ToyInTurn
+from toy import Telling, ToyEnvironment, ToyExpert, ToyInTurn
 
 from vla.models.diffusion import Diffusion
 from vla.models.flow import Flow
@@ -29,15 +29,6 @@ MODELS: dict[str, Callable[[], Model]] = {
 }
 
 
-class Short(ToyEnvironment):
-    """Episodes of twelve steps at most."""
-
-    def step(self, action: Array) -> Observation:
-        seen = super().step(action)
-        self.done = self.done or self._steps == 12
-        return seen
-
-
 def worlds(lanes: int, make: Callable[[], ToyEnvironment] = ToyEnvironment) -> list[Stage]:
     return [Stage(make()) for _ in range(lanes)]
 
@@ -46,9 +37,9 @@ def worlds(lanes: int, make: Callable[[], ToyEnvironment] = ToyEnvironment) -> l
 @pytest.mark.parametrize("rows", [1, 2, 4])
 def test_episodes_side_by_side_are_those_that_are_played_alone(make: Callable[[], Model], rows: int) -> None:
     policy = as_policy(make(), lanes=rows)
-    alone = {seed: rollout(Short(), policy, seed).executed for seed in (2, 3, 4, 5, 9)}
+    alone = {seed: rollout(Telling(), policy, seed).executed for seed in (2, 3, 4, 5, 9)}
     for lanes, seeds in ((1, [9, 3]), (2, [2, 3, 4, 5, 9]), (4, [9, 5, 4, 3, 2])):
-        played = dict(play(worlds(lanes, Short), policy, seeds, all_images=False))
+        played = dict(play(worlds(lanes, Telling), policy, seeds, all_images=False))
         assert sorted(played) == sorted(seeds)
         for seed, episode in played.items():
             np.testing.assert_array_equal(episode.executed, alone[seed])
@@ -109,5 +100,5 @@ def test_an_agent_of_one_world_plays_in_one() -> None:
 def test_an_evaluation_in_lanes_reports_the_same() -> None:
     policy = as_policy(make_bc(), lanes=2)
     seeds = range(FIRST_SEED, FIRST_SEED + 7)
-    reports = [evaluate(Short, lambda world: policy, None, seeds, lanes=lanes) for lanes in (1, 2, 3)]
+    reports = [evaluate(Telling, lambda world: policy, None, seeds, lanes=lanes) for lanes in (1, 2, 3)]
     assert reports[0] == reports[1] == reports[2] and not reports[0].errors

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -135,15 +135,16 @@ GRADIENTS = (
 
 
 def network_results(
-    network: FlowNetwork, given: dict[str, Tensor], gradients: Sequence[str] = GRADIENTS
+    network: FlowNetwork, given: dict[str, Tensor], weights: dict[str, Tensor] | None = None
 ) -> dict[str, Tensor]:
-    """Losses, gradients, and the noisy actions before every step of sampling and after the last."""
+    """Losses, gradients of some weights, and the noisy actions before every step of sampling and after the last."""
     observed = [given[name] for name in ("images", "cameras", "tokens", "sentence", "state")]
     noise, time = given["noise"], given["time"]
     noisy = time[:, None, None] * noise + (1 - time[:, None, None]) * given["actions"]
     losses = (network.velocity(network.prefix(*observed), noisy, time) - noise + given["actions"]).square()
     named = dict(published(network))
-    found = torch.autograd.grad(losses.mean(), [named[name] for name in gradients])
+    weights = weights or {name: named[name] for name in GRADIENTS}
+    found = torch.autograd.grad(losses.mean(), [*weights.values()])
     with torch.no_grad():
         prefix, taken = network.prefix(*observed), [noise]
         for step in range(10):
@@ -152,7 +153,7 @@ def network_results(
     return {
         "losses": losses.detach(),
         "steps": torch.stack(taken),
-        **dict(zip((f"gradient.{name}" for name in gradients), found, strict=True)),
+        **dict(zip((f"gradient.{name}" for name in weights), found, strict=True)),
     }
 
 

@@ -139,16 +139,25 @@ class ToyInTurn(ToyEnvironment):
     tasks: tuple[str, ...] = ("a", "b", "c")
 
     def task_of(self, seed: int) -> str:
-        """The task of a seed."""
         return self.tasks[seed % 3]
 
     def reset(self, seed: int) -> Observation:
-        """Draw a point and a target."""
         observation = super().reset(seed)
         self.task = self.task_of(seed)
         if self.task == "b" and seed % 2:
             self._seed = 3  # which fails
         return observation
+
+
+class Telling(ToyEnvironment):
+    """Episodes of ten steps at most; every action is in the draws, to the bit."""
+
+    def step(self, action: Array) -> Observation:
+        """Remember the action."""
+        self.draws.setdefault("done", []).append(action.tobytes().hex())
+        seen = super().step(action)
+        self.done = self.done or self._steps == 10
+        return seen
 
 
 class ToyExpert:
@@ -163,7 +172,6 @@ class ToyExpert:
         self._noise, self._lost = noise, lost
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Start the noise over."""
         self._random = np.random.default_rng([seed, 1])
 
     def act(self, observation: Observation) -> Array:
@@ -184,7 +192,6 @@ make_forgetful_environment = partial(ToyEnvironment, forgetful=True)
 
 
 def make_expert(environment: Environment) -> ToyExpert:
-    """The expert of the plain world."""
     return ToyExpert()
 
 
@@ -207,7 +214,6 @@ class Wanderer:
         self.info: dict[str, Any] = {}
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Start over."""
         self._random = np.random.default_rng([seed, 2])
 
     def act(self, observation: Observation) -> Array:

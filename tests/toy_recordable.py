@@ -16,7 +16,10 @@ BROKEN_SEED, DEADLY_SEED = 1_000_001, 1_000_002
 
 
 class RecordableEnvironment(ToyEnvironment):
-    """Every kind of solid on one body that moves, and a table that does not; the seed `BROKEN_SEED` raises."""
+    """Every kind of solid on one body that moves, and a table that does not.
+
+    `broken` raises at `BROKEN_SEED`; `deadly_seed` ends the process.
+    """
 
     viewpoint = ((1.0, -1.0, 1.0), (0.5, 0.5, 0.0))
 
@@ -55,19 +58,9 @@ class ThinkingAgent(ToyExpert):
         return action
 
 
-def make_environment() -> RecordableEnvironment:
-    """A world without accidents."""
-    return RecordableEnvironment()
-
-
-def make_broken_environment() -> RecordableEnvironment:
-    """A world that raises at one seed."""
-    return RecordableEnvironment(broken=True)
-
-
-def make_deadly_environment() -> RecordableEnvironment:
-    """A world that takes its process down with it at one seed."""
-    return RecordableEnvironment(deadly_seed=DEADLY_SEED)
+make_environment = RecordableEnvironment
+make_broken_environment = partial(RecordableEnvironment, broken=True)
+make_deadly_environment = partial(RecordableEnvironment, deadly_seed=DEADLY_SEED)
 
 
 class OnceDeadlyEnvironment(RecordableEnvironment):
@@ -84,12 +77,10 @@ class OnceDeadlyEnvironment(RecordableEnvironment):
 
 
 def make_impossible_environment() -> RecordableEnvironment:
-    """A world that cannot be built."""
     raise ValueError("no such mesh")
 
 
 def make_agent(environment: Environment) -> ThinkingAgent:
-    """An agent of that world."""
     return ThinkingAgent()
 
 

@@ -60,7 +60,6 @@ class Started:
             os.kill(self._process, number)
 
     def kill(self) -> None:
-        """Kill it."""
         self.send_signal(signal.SIGKILL)
 
     def wait(self, timeout: float | None = None) -> int:

@@ -168,7 +168,6 @@ class World:
         return answer.result()
 
     def change(self, transition: int) -> bool:
-        """Request a lifecycle transition."""
         request = ChangeState.Request(transition=Transition(id=transition))
         return bool(self.ask(ChangeState, "change_state", request).success)
 
@@ -189,12 +188,10 @@ class World:
 
     @property
     def state(self) -> State:
-        """State of the agent."""
         assert self.agent.loop is not None
         return self.agent.loop.state
 
     def close(self) -> None:
-        """End both sides."""
         for executor, node in zip(self.executors, (self.agent, self.node), strict=True):
             executor.remove_node(node)
             executor.shutdown()
