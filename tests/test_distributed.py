@@ -127,7 +127,7 @@ def test_what_the_machine_lacks_is_said_before_anything_is_done(
 
 def test_what_lightning_refuses_is_not_blamed_on_the_machine() -> None:
     with pytest.raises(ValueError, match=r"^Lightning refuses the trainer: .*algorithm"):
-        make_trainer(composed("trainer=cpu", "+trainer.gradient_clip_algorithm=nrom").config, None)
+        make_trainer(composed("model=rt1_tiny", "trainer=cpu", "+trainer.gradient_clip_algorithm=nrom").config, None)
 
 
 def test_ddp_trains_on_two_processes_and_evaluates_once(home: Path) -> None:

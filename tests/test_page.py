@@ -31,7 +31,7 @@ from vla.reports.run_page import write_page
 from vla.reports.training_curves import training_sections
 from vla.rollouts.moving_picture import save_moving_picture
 from vla.rollouts.recorder import RerunRecorder
-from vla.rollouts.recordings import merge_recordings, shown
+from vla.rollouts.recordings import keep_pictures, merge_recordings, shown
 from vla.rollouts.results import Report, Result
 from vla.rollouts.rollout import rollout
 from vla.rollouts.statistics import pooled_interval
@@ -62,6 +62,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     episodes = [rollout(environment, ThinkingAgent(), seed, recorder) for seed in SEEN]
     report = Report(tuple(Result(each.seed, each.outcome, each.instruction) for each in episodes))
     merge_recordings(report, folder / "recordings", folder / "rollouts.rrd", "all")
+    keep_pictures(report, folder / "recordings", "all")
     first = [episode.observations[0] for episode in episodes]
     batch: dict[str, Any] = {
         "rgb": {name: np.stack([seen.rgb[name] for seen in first])[:, None] for name in first[0].rgb},

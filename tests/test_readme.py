@@ -120,7 +120,7 @@ def require_floors(measures: dict[str, dict[str, Any]]) -> None:
     stages = ("physics", "rendering", "expert, controller, judge", "images into arrays", "replay", "storing")
     assert set(measures) == {
         *("collect", *(f"collect: {stage}" for stage in stages), f"collect: {cores()} processes"),
-        *(f"collect: rendering, {name}" for name in ("fast", "smooth", "detailed", "mujoco")),
+        *(f"collect: rendering, {name}" for name in ("fast", "smooth", "detailed", "whole", "mujoco")),
         *("loader", "loader: 1 frame", "loader: 6 frames"),
         *(f"loader: 3 x 224 px, {codec}{of}" for codec in ("lossless", "jpeg") for of in ("", ", 2500 x 100 steps")),
         *("train: fp32", "policy"),
