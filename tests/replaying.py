@@ -20,7 +20,9 @@ def same(one: list[Observation], other: list[Observation]) -> bool:
     """Whether states, truth, pictures and depths are the same, bit for bit."""
     return all(
         np.array_equal(a.state, b.state)
+        and a.rgb.keys() == b.rgb.keys()
         and all(np.array_equal(a.rgb[name], b.rgb[name]) for name in a.rgb)
+        and a.depth.keys() == b.depth.keys()
         and all(np.array_equal(a.depth[name], b.depth[name]) for name in a.depth)
         and all(np.array_equal((a.truth or {})[name], (b.truth or {})[name]) for name in a.truth or {})
         for a, b in zip(one, other, strict=True)

@@ -17,7 +17,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from vla.config.build import build
 from vla.config.experiment import plain
-from vla.deploy.bag_import import BagDemonstrations, _Picture, _Segment
+from vla.deploy.bag_import import BagDemonstrations, _Bag, _Picture, _Segment
 from vla.deploy.observer import Measured
 from vla.deploy.settings import Topics
 from vla.spec import Episode
@@ -146,6 +146,29 @@ def test_an_empty_instruction_ends_nothing_where_a_status_tells_what_goes_on(tmp
     )
     demonstrations = imported(bags.write(tmp_path / "bag", parts))
     assert [demonstrations.numbers(number)[0] for number in range(len(demonstrations))] == ["lift it"] * 2
+
+
+def test_joint_states_count_when_they_were_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = bags.Session._joint_state
+
+    def late(session: bags.Session, joints: Any) -> Any:  # by 0.1 s
+        session.now -= 0.1
+        message = written(session, joints)
+        session.now += 0.1
+        return message
+
+    monkeypatch.setattr(bags.Session, "_joint_state", late)
+    measured = _Bag(bags.write(tmp_path / "bag"), TOPICS, ROBOT).measured
+    assert [at for at, _ in measured[:3]] == pytest.approx([-0.08, -0.06, -0.04], abs=0.011)
+
+
+def test_gaps_and_long_instructions_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    steps, blind = bags.moving(8, 0), bags.Part("running", bags.moving(4, 0), images=False)
+    parts = (bags.Part("running", steps, instruction="lift it"), blind, bags.Part("running", steps))
+    imported(bags.write(tmp_path / "gap", parts))
+    assert "no step for up to 0.50 s" in caplog.text
+    with pytest.raises(ValueError, match="an instruction of 1600 characters"):
+        imported(bags.write(tmp_path / "long", [bags.Part("running", steps, instruction="lift it " * 200)]))
 
 
 def test_a_segment_without_images_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -17,6 +17,11 @@ from vla.models.model import Model
 from vla.parallel.limits import cores
 
 
+def test_an_evaluation_is_measured_of_a_trained_policy_only() -> None:
+    with pytest.raises(UserError, match=r"plays a trained policy: add checkpoint=RUN"):
+        acting.evaluate(Experiment.of(composed("job=benchmark")))
+
+
 def test_a_measure_stands_beside_its_floor_and_the_machine() -> None:
     expected = {"value": 3.0, "unit": "ms", "n": 5, "floor": 2.0, "ratio": 1.5}
     assert measure(3.0, "ms", 5, 2.0) == expected

@@ -274,7 +274,7 @@ def test_what_is_removed_from_the_command_line_is_told_before_any_work() -> None
         check(cfg)
 
 
-@pytest.mark.parametrize("renderer", ["mujoco", "detailed", "fast"])
+@pytest.mark.parametrize("renderer", ["mujoco", "detailed", "fast", "smooth", "whole"])
 def test_an_experiment_goes_with_every_renderer(renderer: str) -> None:
     check(composed("job=collect", "experiment=libero", f"task/renderer={renderer}"))
 

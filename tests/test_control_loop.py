@@ -86,6 +86,18 @@ def test_the_measured_pose_is_held_until_there_is_an_instruction() -> None:
     assert world.loop.state is State.WAITING and "instruction" in world.loop.reason
 
 
+def test_whether_the_arm_follows_a_plan_is_told(world: World) -> None:
+    world.answer = lambda observation: None
+    world.run(0.2)
+    assert world.loop.set_plan(FORWARD)
+    assert not world.loop.set_plan(FORWARD)  # for which nobody has asked
+    world.run(0.2)
+    world.loop.on_instruction("something else", world.now)
+    assert not world.loop.set_plan(FORWARD)
+    world.run(0.2)
+    assert not world.loop.set_plan(np.full_like(FORWARD, np.nan))
+
+
 def test_an_arm_is_not_taken_over_where_it_was_long_ago() -> None:
     world = World()
     world.measures = False

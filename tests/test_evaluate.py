@@ -6,6 +6,7 @@ import os
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +16,9 @@ from rerun.chunk import RrdReader
 
 from vla.config.experiment import Experiment
 from vla.jobs.evaluate import require_possible
-from vla.parallel.pool import Cluster
+from vla.parallel.pool import Cluster, Crashed
 from vla.reports.evaluation import summary, write_report
-from vla.rollouts.evaluate import evaluate
+from vla.rollouts.evaluate import _RolloutWorker, evaluate
 from vla.rollouts.recordings import chosen, keep_pictures, merge_recordings
 from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import wilson_interval
@@ -191,6 +192,19 @@ def test_only_the_episode_that_kills_its_process_is_an_error_also_of_those_side_
     )
     assert [result.seed for result in report.results] == [*SEEDS]
     assert sorted(result.seed for result in kept) == [seed for seed in SEEDS if seed != toy.DEADLY_SEED]
+
+
+def test_the_episodes_of_a_crashed_group_are_played_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    attempt, kept = _RolloutWorker.attempt, list[int]()
+
+    def crash(worker: Any, item: Any) -> Any:
+        if item[0][0] == SEEDS[0] and len(item[0]) > 1:
+            raise Crashed("gone")
+        return attempt(worker, item)
+
+    monkeypatch.setattr(_RolloutWorker, "attempt", crash)
+    evaluate(toy.make_environment, toy.make_agent, None, SEEDS, lanes=2, keep=lambda each: kept.append(each.seed))
+    assert kept == [*SEEDS[8:], *SEEDS[:8]]
 
 
 def test_a_process_that_dies_once_costs_nothing(tmp_path: Path) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import toy
 from composing import composed
+from gymnasium.error import DependencyNotInstalled
 from saved_policies import save_policy
 
 from vla.config import packages
@@ -165,3 +167,10 @@ def test_demonstrations_are_collected_and_replayed_as_in_the_world_within(folder
     assert {entry.task for entry in store.episodes} == {"toy/Toy-v0"}
     for name in ("rgb_eye.bin", "state.bin", "action.bin", "executed.bin", "truth.bin"):
         assert (store.folder / name).read_bytes() == (folder / name).read_bytes(), name
+
+
+def test_a_world_whose_library_is_missing_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    missing = Mock(side_effect=DependencyNotInstalled("no pygame"))
+    monkeypatch.setattr("toy_gym.Toy.reset", missing)
+    with pytest.raises(ValueError, match=r"task\.id=toy/Toy-v0 cannot be played: no pygame"):
+        make()

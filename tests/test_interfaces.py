@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -28,7 +29,7 @@ TASK = "vla.envs:vla/Tabletop-v0"
 
 
 class Falling(ToyEnvironment):
-    """The toy world, in which the second step is a failure that ends the episode."""
+    """The toy world, in which the first step is a failure that ends the episode."""
 
     def step(self, action: Any) -> Observation:
         observation = super().step(action)
@@ -44,6 +45,16 @@ def test_a_failure_is_no_time_limit() -> None:
     adapted.reset(3)
     last = adapted.step(np.zeros(3, np.float32))
     assert last.last() and (last.reward, last.discount) == (0.0, 0.0)
+
+
+def test_images_are_contiguous_though_a_world_mirrors_its_own() -> None:
+    class Mirrored(ToyEnvironment):
+        def reset(self, seed: int) -> Observation:
+            seen = super().reset(seed)
+            return replace(seen, rgb={name: image[::-1] for name, image in seen.rgb.items()})
+
+    seen = GymEnvironment(Mirrored()).reset(seed=3)[0], DmEnvironment(Mirrored()).reset(3).observation
+    assert all(each["eye"].flags.c_contiguous for each in seen)
 
 
 @pytest.fixture(scope="module")

@@ -65,7 +65,7 @@ def test_other_words_replace_all_that_is_named_or_nothing_is_said() -> None:
 
 
 def test_a_word_that_the_goal_fills_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"task\.goal\.language\.words has \['pad'\], which Place itself fills"):
+    with pytest.raises(ValueError, match=r"task\.goal\.language has words for pad, slots that goals fill"):
         build(plain(composed("task/goal=place", "+task.goal.language.words.pad=[pad,disc]").task), "task")
 
 

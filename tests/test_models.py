@@ -62,6 +62,12 @@ def made(name: str, **options: Any) -> tuple[Any, dict[str, Any]]:
     return model, {**batch, "action": torch.from_numpy(chunks[rows])}
 
 
+def test_an_infinite_truth_leaves_the_statistics_alone() -> None:
+    model, batch = made("rt1")
+    batch["truth"][0] = torch.inf
+    assert model.loss(batch)["loss"].isfinite() and model.truth_scale.variance.isfinite().all()
+
+
 @every_model
 def test_shapes(name: str) -> None:
     model, batch = made(name)

@@ -6,6 +6,7 @@ import json
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import toy_recordable as toy
@@ -43,6 +44,16 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     here(folder, *COMMAND, "output=run")
     assert not (folder / "run" / PLAYED).exists()
     return reported(folder / "run")
+
+
+def test_a_report_without_room_costs_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = [each for each in COMMAND if each != "recorder=none"]
+    asked += ["evaluate.recordings=all", "task.image_size=[32,32]", "output=run"]
+    with monkeypatch.context() as patch:
+        patch.setattr("vla.jobs.evaluate.write_report", Mock(side_effect=OSError(28, "No space left on device")))
+        here(tmp_path, *asked, ok=False)
+    here(tmp_path, *asked)
+    assert len(reported(tmp_path / "run")["recorded"]) == EPISODES
 
 
 def test_a_report_without_room_costs_no_episode(tmp_path: Path, whole: dict[str, Any]) -> None:

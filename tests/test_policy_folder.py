@@ -266,6 +266,12 @@ def test_a_hostile_folder_ends_in_one_sentence(attack: str, tmp_path: Path) -> N
     assert len(str(caught.value)) < 1000 and "secret" not in str(caught.value)
 
 
+def test_any_seed_of_validation_can_be_read_again(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "policy")
+    key("training.json", validation=[2**31, 4])(folder)
+    assert read_policy(folder).training.validation == (2**31, 4)
+
+
 def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="does not fit the model of its own configuration"):
         read_policy(saved(tmp_path)).restore(make_rt1())

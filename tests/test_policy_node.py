@@ -21,6 +21,7 @@ from test_server import remote, serving
 from world import KINDS, World, positions
 
 from vla.deploy.client_observation import Keys
+from vla.deploy.lifecycle_node import LATCHED
 from vla.deploy.safety import State
 from vla.robots.panda import HOME
 
@@ -334,9 +335,29 @@ def test_trajectories_end_at_rest_and_plain_positions_have_fingers_of_their_own(
 
 
 def test_ros_arguments_remap(make_world: Callable[..., World]) -> None:
-    world = make_world("joint_state", "--ros-args", "-r", "/front:=/isaac/front")
+    world = make_world("joint_state", "--ros-args", "-r", "/front:=/isaac/front/compressed")
     assert world.change(Transition.TRANSITION_CONFIGURE)
-    assert any(name == "/isaac/front" for name, _ in world.agent.get_topic_names_and_types())
+    kinds = dict(world.agent.get_topic_names_and_types())
+    assert kinds["/isaac/front/compressed"] == ["sensor_msgs/msg/CompressedImage"]  # of the name that is listened to
+
+
+def test_whoever_comes_later_gets_the_last_status(make_world: Callable[..., World]) -> None:
+    world, late = make_world(), list[DiagnosticStatus]()
+    policy: Any = world.policy
+    policy.chunk, policy.execute, policy.history, policy.chunking = 8, 4, 2, object()
+    assert world.change(Transition.TRANSITION_CONFIGURE)
+    world.node.create_subscription(DiagnosticStatus, "/vla_agent/status", late.append, LATCHED)
+    world.spin(lambda: late)
+    assert world.agent.loop is not None and world.agent.loop._execute == 1  # a history sees every step
+
+
+def test_a_gripper_that_nothing_commands_is_told(
+    make_world: Callable[..., World], capfd: pytest.CaptureFixture[str]
+) -> None:
+    world = make_world()
+    world.settings.robot = replace(ROBOT, fingers=[])
+    assert world.change(Transition.TRANSITION_CONFIGURE)
+    assert "moves a gripper, and nothing commands it" in capfd.readouterr().err
 
 
 def test_a_robot_that_does_not_fit_refuses_to_configure(make_world: Callable[..., World]) -> None:

@@ -99,13 +99,14 @@ def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: b
 
 
 def test_a_report_of_older_weights_or_compared_with_an_older_run_is_not_this_one(tmp_path: Path) -> None:
-    policy, other = tmp_path / "policy", tmp_path / "other/report.json"
-    other.parent.mkdir()
-    asked = plain(composed(f"evaluate.against={other.parent}"))
+    policy, other, replayed = (tmp_path / name for name in ("policy", "other/report.json", "store/index.jsonl"))
+    for file in (other, replayed):
+        file.parent.mkdir()
+    asked = plain(composed(f"evaluate.against={other.parent}", f"evaluate.nearest={replayed.parent}"))
     report = Report((Result(1_000_000, "success"), Result(1_000_001, "dropped")))
-    for changed in (policy, other):
-        policy.touch()
-        other.touch()
+    for changed in (policy, other, replayed):
+        for file in (policy, other, replayed):
+            file.touch()
         write_report(report, tmp_path / "report.json", str(policy), asked)
         assert cached_success(tmp_path, asked, policy) == 0.5
         assert cached_success(tmp_path, plain(composed("evaluate.episodes=9")), policy) is None

@@ -266,7 +266,7 @@ WRONG: tuple[tuple[dict[str, Any], str], ...] = (
     ),
     (
         {"open": dict.fromkeys(FINGERS, 0.025)},
-        r"leave the fingertips 5\d and \d+ mm apart, which holds no block of 40 mm",
+        r"leave the fingertips 5\d and \d+ mm apart, which holds no block: that takes 52 mm",
     ),
     ({"mount": "b3", "hand": Path("none.xml")}, r"task\.robot\.hand=none\.xml: there is no such file"),
 )

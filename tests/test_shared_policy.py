@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing.shared_memory import SharedMemory
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -88,3 +89,13 @@ def test_what_does_not_fit_is_said_and_no_memory_is_left_behind(monkeypatch: pyt
     for name in used:
         with pytest.raises(FileNotFoundError):
             SharedMemory(name)
+
+
+def test_an_error_that_cannot_be_sent_is_told() -> None:
+    class Odd(Exception): ...
+
+    policy: Any = as_policy(make_bc())
+    policy.act = Mock(side_effect=Odd("no idea"))
+    refused = pytest.raises(RuntimeError, match="Odd: no idea")
+    with shared_policy(lambda: policy) as make_agent, closing(make_agent(ToyEnvironment())) as agent, refused:
+        agent.act(SPEC.random_observation(np.random.default_rng(0)))

@@ -256,7 +256,7 @@ def test_published_weights_and_statistics_are_loaded(tmp_path: Path, tokenizer: 
     cameras = {"front": "wrist", "wrist": "front"}
     with pytest.raises(UserError, match=r"names the cameras of .* in another order: it sees front, wrist"):
         make_smolvla(tokenizer, trunk=str(folder), cameras={"wrist": "front", "front": "wrist"})
-    with pytest.raises(UserError, match=r"normalises by MEAN_STD: set model\.normalization"):
+    with pytest.raises(UserError, match=r"normalises by MEAN_STD, and model\.normalization is quantiles"):
         make_smolvla(tokenizer, trunk=str(folder), statistics="pretrained", normalization="quantiles", cameras=cameras)
     model = make_smolvla(tokenizer, trunk=str(folder), statistics="pretrained", cameras=cameras)
     assert model.cameras == ["wrist", "front"]

@@ -197,7 +197,7 @@ class BagDemonstrations(imported.ImportedDemonstrations):
     over, from motion to rest; `recorded.person` in its draws tells which. Without the topic of the node's status a
     person always moves the arm. The action of a step is the motion that was commanded for one control period; where
     none was, as when an arm is guided by hand, the measured one. Actions beyond the bounds of the task are clipped,
-    depth is 0 (no return). Whether an episode succeeded is not known: its outcome is "unverified".
+    depth is 0. Whether an episode succeeded is not known: its outcome is "unverified".
 
     Args:
         folder: of a bag, or of a folder of bags.
@@ -290,7 +290,8 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         if not steps:
             raise UserError(f"{bag.folder} has no matching images of {', '.join(self.spec.cameras)} in {segment}")
         if longest > LATE * period:
-            log.warning("%s: no images for up to %.2f s in %s", bag.folder, longest, segment)
+            why = "images or joint states are missing, or do not match"
+            log.warning("%s: no step for up to %.2f s in %s: %s", bag.folder, longest, segment, why)
         return steps
 
     def _images(self, bag: _Bag, steps: Sequence[_Step]) -> dict[tuple[str, float], Array]:

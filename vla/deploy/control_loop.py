@@ -237,7 +237,7 @@ class ControlLoop:
             return
         if not self.motion.started and self.state is not State.FAULT:  # which a person must look at first
             if old := self._joints_problem(newest, now):  # the arm may be elsewhere by now
-                return self._set_state(self.state, old)
+                return None if self.state is State.STOPPED else self._set_state(self.state, old)
             self._take_over(newest, now)
         off_track, moved_unseen = self._tracking.check(self.motion, newest, now)
         if moved_unseen or (off_track and self._held):

@@ -6,13 +6,15 @@ from collections import deque
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from vla.deploy.control_loop import ControlLoop
-from vla.deploy.lifecycle_node import LATCHED, GuardedLifecycleNode
+from vla.deploy.lifecycle_node import GuardedLifecycleNode
 from vla.deploy.messages import HANDED_OVER, shorten
 from vla.deploy.safety import State
 
 LEVELS = dict.fromkeys((State.HOLDING, State.STOPPED), DiagnosticStatus.WARN) | {State.FAULT: DiagnosticStatus.ERROR}
+RECENT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # also for whoever comes later
 MAX_MESSAGE = 300  # length of a log line or status message [characters]
 
 
@@ -21,7 +23,7 @@ class Diagnostics:
 
     def __init__(self, node: GuardedLifecycleNode, loop: ControlLoop, dry_run: bool) -> None:
         self._node, self._loop, self._dry_run, self._dropped = node, loop, dry_run, 0
-        self._status = node.add_publisher(DiagnosticStatus, "~/status", qos=LATCHED)
+        self._status = node.add_publisher(DiagnosticStatus, "~/status", qos=RECENT)
         self._array = node.add_publisher(DiagnosticArray, "/diagnostics")
         self._latencies: dict[str, deque[float]] = {}
         self._reported: tuple[State | None, str] = (None, "")

@@ -55,8 +55,11 @@ class Inference:
         if first:
             self._policy.reset(observation.instruction, 0)
         plan = self._policy.plan(observation)
-        # In training the frames of a history have no gaps either.
-        execute = 1 if getattr(self._policy, "history", 1) > 1 else self._policy.execute
         # What the next plan continues goes on until that is there.
-        chosen = plan if getattr(self._policy, "chunking", None) else plan[:execute]
+        chosen = plan if getattr(self._policy, "chunking", None) else plan[: executed(self._policy)]
         return chosen, time.monotonic() - began
+
+
+def executed(policy: Policy) -> int:
+    """Return how many actions of a plan are executed: one with a history, whose frames have no gaps in training."""
+    return 1 if getattr(policy, "history", 1) > 1 else int(policy.execute)

@@ -15,7 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 from vla.deploy.commands import ArmOutput, GripperOutput
 from vla.deploy.control_loop import ControlLoop
 from vla.deploy.diagnostics import Diagnostics
-from vla.deploy.inference import Inference
+from vla.deploy.inference import Inference, executed
 from vla.deploy.inputs import Inputs
 from vla.deploy.lifecycle_node import GuardedLifecycleNode, transition
 from vla.deploy.safety import State
@@ -48,9 +48,7 @@ class PolicyNode(GuardedLifecycleNode):
         if unnamed := sorted(set(spec.cameras) - set(topics.images)):
             missing = ", ".join(unnamed)
             raise UserError(f"no topic for the policy's cameras {missing}: add +deploy.topics.images.{unnamed[0]}")
-        execute = None
-        if getattr(self.policy, "chunking", None):  # a history wants to see every step
-            execute = 1 if getattr(self.policy, "history", 1) > 1 else self.policy.execute
+        execute = executed(self.policy) if getattr(self.policy, "chunking", None) else None
         follows = not settings.dry_run
         loop = ControlLoop(spec, settings.robot, settings.safety, settings.command_hz, follows, execute)
         if settings.gripper is not None and not (loop.goals.has_gripper and topics.gripper):

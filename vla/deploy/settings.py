@@ -28,7 +28,7 @@ FOLLOW = "follow_joint_trajectory"  # the command that is an action
 class Topics:
     """Names of the topics, before remapping (UserError: a name is not valid in ROS)."""
 
-    images: dict[str, str]  # camera → topic of sensor_msgs/Image, or of CompressedImage if it ends with /compressed
+    images: dict[str, str]  # camera → topic of sensor_msgs/Image, or, ending in /compressed, CompressedImage
     joint_states: str  # sensor_msgs/JointState
     instruction: str  # std_msgs/String
     commands: str  # or action server

@@ -94,8 +94,8 @@ def resolved(value: Any, name: str) -> Any:
     """Return a copy of a configuration from a file, called `name`: dicts with texts as keys, lists, and plain values.
 
     Raises:
-        UserError: a value is no mapping, list, text, number or null; a key is no text; a text contains `${`, which
-            would be resolved later; or there are more than `MAX_VALUES` values or `MAX_DEPTH` levels.
+        UserError: a value is no mapping, list, text, finite number or null; a key is no text; a text contains `${`,
+            which would be resolved later; or there are more than `MAX_VALUES` values or `MAX_DEPTH` levels.
     """
     # Exact types, because a checkpoint's pickle can make a mapping whose methods hide what it holds.
     count = itertools.count(1)

@@ -65,7 +65,6 @@ class Model(nn.Module, ABC):
         UserError: `execute` exceeds `chunk`.
     """
 
-    noise: Tensor | None  # (k, …) standard normal, of predictions whose batch has none; None: deterministic
     history = 1  # T, number of frames in the input
     continues = False  # whether its plans can continue running ones, by a `chunking` that the policy sets
     chunking: Chunking | None = None
@@ -88,7 +87,6 @@ class Model(nn.Module, ABC):
         tokenizer: ActionTokenizer,
     ) -> None:
         super().__init__()
-        self.register_buffer("noise", None, persistent=False)
         self.chunk, self.execute = chunk, chunk if execute is None else execute
         if self.execute > chunk:
             raise UserError(f"model.execute={execute} is more than the model.chunk={chunk} actions that are predicted")
@@ -125,7 +123,8 @@ class Model(nn.Module, ABC):
 
     def sample_noise(self, random: torch.Generator) -> Tensor | None:
         """Sample the "noise" of one prediction, (1, k, …), standard normal; None for a deterministic model."""
-        return None if self.noise is None else torch.randn(1, *self.noise.shape, generator=random)
+        noise = getattr(self, "noise", None)
+        return torch.randn(1, *noise.shape, generator=random) if isinstance(noise, Tensor) else None
 
     def predict_truth(self, features: Tensor) -> dict[str, Tensor]:
         """Return truth: (B, T', S), normalised, given (B, T', width) features; nothing without an auxiliary head."""

@@ -85,6 +85,10 @@ def _play_missing(
         for future in pool.as_completed(group_of):
             results = _results(future, group_of[future])
             crashed |= not results
+            if crashed and score.until is not None:  # what comes later does not count before these
+                for later in group_of:
+                    later.cancel()
+                break
             for result in results:
                 score.results[result.seed] = result
                 if result.outcome != ERROR:

@@ -39,7 +39,7 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
     Images are videos, or PNG, JPEG or WebP in tables or files; those of another size are cropped at the centre
     to the aspect ratio of the task, and resized. Actions beyond the bounds of the task are clipped. Every episode is a
     success. An episode in which the task changes becomes several episodes, one per instruction: neither a chunk of
-    actions nor a history may cross the change. Missing features are filled in: depth by 0 (no return), `velocities` of
+    actions nor a history may cross the change. Missing features are filled in: depth by 0, `velocities` of
     the robot by differences of its joint positions, `executed` by the actions to imitate. The draws of the episode list
     them, and its number and first step in the dataset.
 

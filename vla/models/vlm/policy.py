@@ -183,7 +183,7 @@ class VisionLanguageAction(Model):
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
         """Return the mean squared error of the velocity of valid actions, without padding.
 
-        Where actions attend to later ones, the repeated last action of an episode counts among them.
+        Where actions attend to later ones, and without a prefix, the repeated last action of an episode counts, too.
         """
         error = (output["velocity"] - output["target"])[..., : len(self.spec.action)].square().mean(-1)
         copies, ahead = len(error) // len(batch["valid"]), batch["perturbations"][:, -1]

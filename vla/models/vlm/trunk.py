@@ -77,7 +77,10 @@ class Trunk:
         mapping = self._config.get("normalization_mapping") or {}
         modes = {str(mapping[each]) for each in ("STATE", "ACTION") if each in mapping}
         if wrong := modes - {MODES[kind]}:
-            raise UserError(f"{self} normalises by {', '.join(sorted(wrong))}: set model.normalization")
+            raise UserError(
+                f"{self} normalises by {', '.join(sorted(wrong))}, and model.normalization is {kind}: choose the same, "
+                "or model.statistics=demonstrations"
+            )
         path = self.folder / PREPROCESSOR
         steps = read_json(path, dict[str, Any]).get("steps", []) if path.is_file() else []
         files = [step.get("state_file") for step in steps if step.get("registry_name") == NORMALIZER]

@@ -17,6 +17,7 @@ from vla.io.errors import UserError
 from vla.robots.cartesian import LIMIT_MARGIN, Kinematics, rotation_z
 from vla.spec import Array, RobotModel
 from vla.tasks.tabletop import fingertips, robot_spec
+from vla.tasks.tabletop.expert import CLEARANCE
 from vla.tasks.tabletop.robot import PHYSICS, TabletopRobot, attributes
 from vla.tasks.tabletop.robot_file import RobotFile, compiled, require
 from vla.tasks.tabletop.scene import BLOCK_HALF_SIZE
@@ -30,7 +31,7 @@ FASTEST = 0.02  # time in which its whole force moves a finger through its trave
 CLOSING = 0.2  # shortest time in which the gripper closes [s]
 OPENINGS, SETTLING = 17, 250  # commands at which the opening is measured; steps in which the fingers come to rest
 LEAST_TRAVEL = 0.02  # change of the opening of a gripper that can hold a block [m]
-LEAST_OPENING = 2 * BLOCK_HALF_SIZE + 0.012  # around a block [m]
+LEAST_OPENING = 2 * BLOCK_HALF_SIZE + CLEARANCE  # [m]
 ASIDE = 0.08  # largest distance between the tool point and the middle between the closed fingertips [m]
 AROUND_BLOCK = 0.06  # opening with room for a block, in whose middle the tool point belongs [m]
 BESIDE = 0.005  # how far beside this middle it may be [m]
@@ -115,8 +116,9 @@ class FileRobot(TabletopRobot):
         if self.widest - self.narrowest <= LEAST_TRAVEL or self.widest < LEAST_OPENING:
             raise UserError(
                 f"task.robot.open and task.robot.closed leave the fingertips {1000 * self.widest:.0f} and "
-                f"{1000 * self.narrowest:.0f} mm apart, which holds no block of {2000 * BLOCK_HALF_SIZE:.0f} mm; "
-                "task.robot.fingertips may name sites at the ends of the jaws"
+                f"{1000 * self.narrowest:.0f} mm apart, which holds no block: that takes {1000 * LEAST_OPENING:.0f} "
+                f"mm, and {1000 * LEAST_TRAVEL:.0f} mm of travel; task.robot.fingertips may name sites at the ends of "
+                "the jaws"
             )
 
     def _close(self, sides: list[list[str]]) -> Array:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -22,7 +23,6 @@ from vla.tasks.tabletop.robot import (
     camera,
     spread,
 )
-from vla.tasks.tabletop.robot_file import installed
 
 Link = tuple[float, tuple[float, ...], tuple[float, ...]]
 
@@ -41,7 +41,7 @@ TORQUE = (87, 87, 87, 87, 12, 12, 12)  # [N m], Franka Control Interface documen
 STIFFNESS = (4500, 4500, 3500, 3500, 2000, 2000, 2000)  # position servo [N m/rad], as in MuJoCo Menagerie's Panda
 LEAD = 0.05  # servo damping over stiffness [s]: tracks within a control period without overshoot
 ARMATURE = 0.1  # reflected rotor inertia [kg m²], as in MuJoCo Menagerie's Panda
-MESHES = "gymnasium_robotics/envs/assets/kitchen_franka/franka_assets/meshes"  # STL, Apache-2.0
+MESHES = "envs/assets/kitchen_franka/franka_assets/meshes"  # STL of the package gymnasium-robotics, Apache-2.0
 HAND_MASS, FINGER_MASS = 0.73, 0.015  # [kg], franka_description, hand.xacro
 FINGER_OFFSET = 0.0584  # hand to finger along z [m], ibid.
 GRIP_STIFFNESS, GRIP_DAMPING = 1000.0, 40.0  # of the finger servo [N/m], [N s/m]
@@ -144,7 +144,8 @@ def _mjcf(meshes: str) -> str:
 
 def _assets(meshes: str) -> str:
     """Return the meshes that collide and those that are seen."""
-    folder, text = installed(MESHES), ""
+    package: Any = find_spec("gymnasium_robotics")
+    folder, text = Path(package.origin).parent / MESHES, ""
     for name in (*(f"link{index}" for index in range(8)), "hand", "finger"):
         file = folder / "collision" / f"{name}.stl"
         # Convex hulls of the collision meshes; with shadows, every face is rendered twice per camera.

@@ -94,10 +94,10 @@ class InstalledRobot(RobotFile):
     def __init__(self, file: Text, hand: Text | None, **inherited: Inherited) -> None:
         """Take paths that begin with the name of a package, such as dm_control/third_party/kinova/jaco_arm.xml
         (UserError: no such package, or a path out of it)."""
-        super().__init__(file=installed(file), hand=installed(hand) if hand else None, **inherited)
+        super().__init__(file=_installed(file), hand=_installed(hand) if hand else None, **inherited)
 
 
-def installed(path: str) -> Path:
+def _installed(path: str) -> Path:
     """Return a file or folder in a package; one in the working folder, which Python also finds, is not installed."""
     package, _, rest = path.partition("/")
     found = find_spec(package) if package.isidentifier() else None

@@ -125,7 +125,7 @@ class Goal(ABC):
         if unknown := sorted(language.slots - set(known)):
             raise UserError(f"task.goal.language has the slots {unknown}, but {type(self).__name__} fills {known}")
         if taken := sorted(SLOTS & {*language.words, *language.held_out_words}):
-            raise UserError(f"task.goal.language.words has {taken}, which {type(self).__name__} itself fills")
+            raise UserError(f"task.goal.language has words for {', '.join(taken)}, slots that goals fill: rename them")
         if strange := sorted(set(language.held_out_colours) - set(COLOURS)):
             raise UserError(f"task.goal.language.held_out_colours has {strange}, the colours are {', '.join(COLOURS)}")
         self.language, self.hold_steps = language, hold_steps

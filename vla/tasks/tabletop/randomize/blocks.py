@@ -17,7 +17,7 @@ from vla.tasks.tabletop.randomize.randomizer import Angles, Places, rounded
 from vla.tasks.tabletop.scene import COLOURS, PAD_RADIUS, PADS
 
 SHAPES = {"cube": 1.0, "cylinder": 1.0, "tall": 1.25, "flat": 0.75}  # name → height over width
-HalfSize = Annotated[float, Ge(0.005), Le(0.034)]  # which the Panda can grasp, and `ROOM` keeps apart [m]
+HalfSize = Annotated[float, Ge(0.005), Le(0.034)]  # the Panda grasps it, the default clearance suffices [m]
 HalfSizes = Annotated[tuple[HalfSize, HalfSize], Predicate(ascending)]
 ColourNames = Annotated[Sequence[str], MinLen(1), Predicate(unique)]
 ROOM = 0.034  # radius reserved for a block: half the diagonal of the largest one of the default sizes [m]
