@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,12 +19,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from notes import figures_of, rates_of, update
+from notes import compiling_of, figures_of, rates_of, update
 
 ROOT, PROBE = Path(__file__).resolve().parents[2], Path(__file__).with_name("probe.py")
 GRACE = 15  # [s] between an interrupt and the end by force
 LEAST = 8  # [s] with which a command is still started
 NVIDIA = Path("/usr/local/nvidia/share/glvnd/egl_vendor.d/10_nvidia.json")  # where some containers mount the driver
+BY_MESA = "demonstrations_by_mesa"
 NEVER = 1_000_000  # batches: without a validation
 
 
@@ -57,7 +59,9 @@ def real() -> Sizes:
     query = ["nvidia-smi", "--query-gpu=memory.total", "--format=csv,noheader,nounits"]
     memory = int(subprocess.run(query, capture_output=True, text=True, check=True).stdout.split()[0])  # [MiB]
     batch = 40 if memory > 100_000 else 24
-    return Sizes(os.cpu_count() or 1, 2000, 1000, 500, "rt1", batch, 12, 2000, 200, 200, "bf16", True, "gpu", FULL)
+    return Sizes(
+        len(os.sched_getaffinity(0)), 2000, 1000, 500, "rt1", batch, 12, 2000, 200, 200, "bf16", True, "gpu", FULL
+    )
 
 
 class Minutes:
@@ -102,6 +106,8 @@ class Minutes:
         }
         if kit is not None:
             self._unpack(kit)
+        if (self.work / BY_MESA / "store.json").exists():  # in an earlier call the GPU did not draw
+            self._draw_by_mesa()
 
     @property
     def left(self) -> float:
@@ -112,9 +118,12 @@ class Minutes:
         """Unpack the packages and, where there are none, the loaders of OpenGL, which only work in their place."""
         for name in ("site", "mesa"):
             archive = kit / f"{name}.tar.xz"
-            if archive.exists() and not (self.work / name).exists():
+            there = self.work / name
+            if archive.exists() and not (there.exists() and there.stat().st_mtime >= archive.stat().st_mtime):
+                shutil.rmtree(there, ignore_errors=True)  # of an older kit
                 with tarfile.open(archive) as files:
                     files.extractall(self.work, filter="data")
+                os.utime(there)
         libraries = subprocess.run(["ldconfig", "-p"], capture_output=True, text=True).stdout
         if "libEGL.so.1" not in libraries and self.sizes.trainer == "gpu":
             for package in sorted(kit.glob("gl/*.deb")):
@@ -174,14 +183,18 @@ class Minutes:
             elsewhere = [f"collect.folder={self.work / 'compared'}", f"collect.episodes={sizes.compared}"]
             self.vla("b", "collect_by_mesa", 60, "job=collect", *elsewhere, **self._mesa())
         else:  # the other steps need demonstrations, and draw in the same way
-            self.environment |= self._mesa()
-            self._demonstrations = self.work / "demonstrations_by_mesa"
+            self._draw_by_mesa()
             self.vla("b", "collect_by_mesa", 170, "job=collect", *self.data(sizes.demonstrations))
 
+    def _draw_by_mesa(self) -> None:
+        """Use Mesa, and demonstrations that it has drawn, from now on."""
+        self.environment |= self._mesa()
+        self._demonstrations = self.work / BY_MESA
+
     def _mesa(self) -> dict[str, str]:
-        folder = self.work / "mesa"
+        folder, before = self.work / "mesa", os.environ.get("LD_LIBRARY_PATH")  # which may lead to the GPU's driver
         return {
-            "LD_LIBRARY_PATH": str(folder / "lib"),
+            "LD_LIBRARY_PATH": os.pathsep.join(filter(None, (str(folder / "lib"), before))),
             "LIBGL_DRIVERS_PATH": str(folder / "dri"),
             "__EGL_VENDOR_LIBRARY_FILENAMES": str(folder / "vendor.json"),
             "EGL_PLATFORM": "surfaceless",
@@ -203,14 +216,18 @@ class Minutes:
         self.vla(step, name, limit, *asked, *timing, *what, *self.data(sizes.used))
 
     def d(self) -> None:
-        """Train the large model for as long as there is time, in the way that c found faster, and evaluate it."""
+        """Train the large model for as long as there is time, in the way that c found faster, and evaluate it.
+
+        It compiles another graph than c, with what `overrides` change, and ends in time to write its policy.
+        """
         sizes, seconds = self.sizes, min(self.learn, self.left - 120)  # 30 s to start, 90 s to evaluate
         rates = rates_of(self.out / "c.json") or {"eager": 5.0 * sizes.batch}
-        fastest = max(rates, key=lambda kind: rates[kind])
-        steps = self.steps or max(20, int(0.93 * rates[fastest] * seconds / sizes.batch))
+        gains = {kind: rate * (seconds - compiling_of(self.out / "c.json", kind)) for kind, rate in rates.items()}
+        fastest = max(gains, key=lambda kind: gains[kind])
+        steps = self.steps or max(20, int(0.93 * gains[fastest] / sizes.batch))
         model = [f"model={sizes.model}", "learner.lr=5e-4", f"data.batch_size={sizes.batch}", *self.overrides]
-        demonstrations = self.data(sizes.demonstrations)
-        self.train("d", "rt1", seconds + 30, steps, fastest == "compiled", *demonstrations, *model)
+        length = [*self.data(sizes.demonstrations), f"+trainer.max_time={{seconds: {max(seconds, 1):.0f}}}"]
+        self.train("d", "rt1", seconds + 30, steps, fastest == "compiled", *length, *model)
 
     def g(self) -> None:
         """Train bc, and evaluate it."""
@@ -223,12 +240,16 @@ class Minutes:
         settings = [f"trainer={sizes.trainer}", f"trainer.precision={sizes.precision}", f"trainer.max_steps={steps}"]
         settings += [f"trainer.val_check_interval={NEVER}", f"trainer.log_every_n_steps={min(20, steps)}"]
         settings += ["job=train", "validate.episodes=0", *overrides]
+        for each in (name, f"{name}_eager", f"{name}_evaluated", f"{name}_eager_evaluated"):
+            shutil.rmtree(self.work / "runs" / each, ignore_errors=True)  # of an earlier call
         ended = self.vla(step, name, limit, f"learner.compile={compiled}", *settings)
-        if compiled and isinstance(ended["status"], int) and ended["status"]:
+        if compiled and ended["status"] not in (0, None):
             name = f"{name}_eager"
-            self.vla(step, name, limit, "learner.compile=False", *settings)
-        checkpoint = f"checkpoint={self.work / 'runs' / name}"
-        self.vla(step, f"{name}_evaluated", 150, checkpoint, f"evaluate.episodes={sizes.evaluated}")
+            ended = self.vla(step, name, limit, "learner.compile=False", *settings)
+        if ended["status"] == 0:
+            asked = [f"checkpoint={self.work / 'runs' / name}", f"evaluate.episodes={sizes.evaluated}"]
+            asked += ["cluster.policy=here", f"policy.lanes={min(sizes.workers, 16)}"] if sizes.trainer == "gpu" else []
+            self.vla(step, f"{name}_evaluated", 150, *asked)
 
     def e(self) -> None:
         """Time single decisions of policies."""
@@ -262,9 +283,9 @@ class Minutes:
         """Time rendering, other sizes of a batch, and TensorFloat-32."""
         sizes = self.sizes
         self.vla("h", "rendering", 60, "job=benchmark", "benchmark.names=[collect]", "benchmark.episodes=3")
-        for batch in (max(sizes.batch // 3, 2), sizes.batch * 4 // 3, sizes.batch * 2):
+        for batch in (max(sizes.batch // 3, 2), sizes.batch * 4 // 3):
             self.rate("h", f"batch_{batch}", 45, batch, sizes.precision, False)
-        self.rate("h", "tf32", 60, sizes.batch, "fp32", False)
+        self.rate("h", "tf32", 60, max(sizes.batch // 2, 2), "fp32", False)  # which takes twice the memory
 
 
 def _ended(process: subprocess.Popen[bytes], limit: float) -> int | str:

@@ -42,3 +42,10 @@ def rates_of(file: Path) -> dict[str, float]:
             if name.startswith("train: ") and name.count(":") == 1 and "loader" not in name:
                 rates[kind] = float(measure["value"])
     return rates
+
+
+def compiling_of(file: Path, kind: str) -> float:
+    """Return how much longer than the eager training another kind took in the file of step c [s]: it compiles."""
+    noted = json.loads(file.read_text()) if file.exists() else {}
+    taken, eager = (float(noted.get(each, {}).get("seconds", 0)) for each in (kind, "eager"))
+    return max(0.0, taken - eager)

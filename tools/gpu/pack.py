@@ -22,6 +22,7 @@ from tempfile import TemporaryDirectory
 ROOT = Path(__file__).resolve().parents[2]
 LARGEST = 45 * 2**20  # [bytes] of the folder
 # Of what vla depends on, the machine has these, and the two that only videos and recordings need, 36 and 171 MB, stay.
+# It also has lxml, of dm_control, and for step v transformers and peft.
 THERE = {
     *("filelock", "jinja2", "lightning", "matplotlib", "numpy", "pillow", "psutil", "pyarrow", "pyyaml", "rich"),
     *("safetensors", "scipy", "tensorboard", "timm", "tokenizers", "torch", "torchmetrics", "torchvision"),
