@@ -18,7 +18,6 @@ from vla.tasks.libero.package import tasks_of
 from vla.tasks.libero.scene import Detail, load_scene
 from vla.tasks.libero.starts import Starts, set_start
 
-SUITES = {"libero_spatial": "spatial", "libero_object": "object", "libero_goal": "goal", "libero_10": "long"}
 DETAIL = Detail(6000, 2500, 3000, 256)  # of the pictures, which is to leave physics as it is
 
 
@@ -26,8 +25,8 @@ def main() -> None:
     """Compare every task of a folder."""
     worst, agreed, judged = 0.0, 0, 0
     for file in sorted(Path(sys.argv[1]).glob("*.npz")):
-        suite, _, number = file.stem.rpartition("_")
-        task, reference = tasks_of(SUITES[suite])[int(number)], np.load(file)
+        suite, _, number = file.stem.removeprefix("libero_").rpartition("_")  # of 10_swap: long_swap
+        task, reference = tasks_of(suite.replace("10", "long"))[int(number)], np.load(file)
         model = load_scene(task.scene, ["nothing"], DETAIL)
         data, controller, goal = mujoco.MjData(model), Controller(model), Goal(model, task.goal)
         set_start(model, data, Starts(model, task).official(0))

@@ -58,6 +58,8 @@ def main() -> None:
     original, rows, differences = Original(), [], []
     with closing(Experiment.of(compose("task=libero", "output=none", *options)).make_environment()()) as environment:
         assert isinstance(environment, Libero)
+        if unknown := {*shown} - {*environment.tasks}:
+            raise SystemExit(f"there are no tasks {', '.join(sorted(unknown))}; there is {environment.tasks[0]}")
         for number, name in enumerate(environment.tasks):
             suite, _, place = name.rpartition("_")
             seen = environment.reset(FIRST_SEED + (number - FIRST_SEED) % len(environment.tasks))
@@ -66,7 +68,7 @@ def main() -> None:
             pairs = list(zip(theirs, ours, strict=True))
             differences.append([np.abs(one.astype(int) - other).mean() for one, other in pairs])
             print(f"{name:10}", " ".join(f"{difference:5.2f}" for difference in differences[-1]), flush=True)
-            if name in shown:
+            if name in (shown or environment.tasks):
                 rows.append(np.concatenate([*theirs, *ours], axis=1))
     print(f"mean {np.mean(differences):.2f}, worst task {np.max(np.mean(differences, axis=1)):.2f}")
     if sheet:

@@ -30,12 +30,12 @@ from vla.models.policy_folder import read_policy
 UNITS = np.array([100, 100, 100, -1], np.float32)  # LeRobot's actions are in cm, and 1 closes
 
 
-def main(
-    run: str, folder: str, seed: str, episodes: str, output: str, tasks: str = "easy,medium,hard,very_hard"
-) -> None:
-    """Play the episodes of all tasks, without videos, and write their successes."""
+def main(run: str, folder: str, seed: str, episodes: str, output: str, tasks: str = "") -> None:
+    """Play the episodes of all tasks, or of the named ones, without videos, and write their successes."""
     torch.set_num_threads(1)
-    spec = read_policy(run).spec
+    saved = read_policy(run)
+    spec = saved.spec
+    every = (f"{name}-v3" for names in saved.config["task"]["tiers"].values() for name in names)
     config = PreTrainedConfig.from_pretrained(folder, local_files_only=True)
     config.device, config.pretrained_path = "cpu", Path(folder)
     policy = get_policy_class(config.type).from_pretrained(folder, config=config).eval()
@@ -51,7 +51,7 @@ def main(
         return {ACTION: batch[ACTION].clamp(low, high) * torch.from_numpy(UNITS)}
 
     info = eval_policy_all(
-        envs=make_env(MetaworldEnv(task=tasks)),
+        envs=make_env(MetaworldEnv(task=tasks or ",".join(every))),
         policy=policy,
         env_preprocessor=see,
         env_postprocessor=act,

@@ -28,6 +28,8 @@ from vla.rollouts.statistics import wilson_interval
 def theirs(folder: Path) -> Iterator[tuple[str, list[bool]]]:
     """Yield the tasks of an evaluation by LeRobot, with the success of each episode."""
     for each in json.loads((folder / "eval_info.json").read_text(encoding="utf-8"))["per_task"]:
+        if not each["task_group"].endswith("-v3"):
+            raise SystemExit(f"{folder} has the group {each['task_group']}: evaluate tasks by name, such as reach-v3")
         yield each["task_group"].removesuffix("-v3"), each["metrics"]["successes"]
 
 
