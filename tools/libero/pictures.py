@@ -59,7 +59,7 @@ def main() -> None:
     with closing(Experiment.of(compose("task=libero", "output=none", *options)).make_environment()()) as environment:
         assert isinstance(environment, Libero)
         if unknown := {*shown} - {*environment.tasks}:
-            raise SystemExit(f"there are no tasks {', '.join(sorted(unknown))}; there is {environment.tasks[0]}")
+            raise SystemExit(f"there are no tasks {', '.join(map(str, unknown))}; there is {environment.tasks[0]}")
         for number, name in enumerate(environment.tasks):
             suite, _, place = name.rpartition("_")
             seen = environment.reset(FIRST_SEED + (number - FIRST_SEED) % len(environment.tasks))
