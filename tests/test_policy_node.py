@@ -354,8 +354,8 @@ def test_whoever_comes_later_gets_the_last_status(make_world: Callable[..., Worl
 def test_a_gripper_that_nothing_commands_is_told(
     make_world: Callable[..., World], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    world = make_world()
-    world.settings.robot = replace(ROBOT, fingers=[])
+    world = make_world("trajectory")
+    world.settings.topics = replace(world.settings.topics, gripper=None)
     assert world.change(Transition.TRANSITION_CONFIGURE)
     assert "moves a gripper, and nothing commands it" in capfd.readouterr().err
 
