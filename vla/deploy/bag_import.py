@@ -136,8 +136,9 @@ class _Bag:
 
     def sees(self, camera: str, segment: _Segment) -> bool:
         """Return whether there are images of a camera in a segment."""
-        within = self.inputs[bisect_left(self.inputs, segment.start, key=WHEN) :]
-        pictures = (each for at, each in within if isinstance(each, _Picture) and at <= segment.end)
+        ends = ((bisect_left, segment.start), (bisect_right, segment.end))
+        first, stop = (bisect(self.inputs, at, key=WHEN) for bisect, at in ends)
+        pictures = (each for _, each in self.inputs[first:stop] if isinstance(each, _Picture))
         return any(each.camera == camera and each.taken >= segment.start for each in pictures)
 
     def _see(self, camera: str, at: float, message: Any) -> None:

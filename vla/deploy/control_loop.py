@@ -134,8 +134,8 @@ class ControlLoop:
         """Command the arm again, from its measured pose; the gripper is left as it is until the policy moves it
         (UserError: the arm moves, is outside its limits, or has no recent joint state; the person keeps it)."""
         measured = self._observer.newest
-        if measured is None or now - measured.at > self.safety.joints_age:
-            raise UserError(self._joints_problem(measured, now))
+        if (old := self._joints_problem(now)) or measured is None:
+            raise UserError(old)
         if self._observer.moved(STILL_FOR) > STILL:
             raise UserError("the arm still moves: let it rest first")
         self.motion.start(measured.joints, None, now)
@@ -236,7 +236,7 @@ class ControlLoop:
         if newest is None:
             return
         if not self.motion.started and self.state is not State.FAULT:  # which a person must look at first
-            if old := self._joints_problem(newest, now):  # the arm may be elsewhere by now
+            if old := self._joints_problem(now):  # the arm may be elsewhere by now
                 return None if self.state is State.STOPPED else self._set_state(self.state, old)
             self._take_over(newest, now)
         off_track, moved_unseen = self._tracking.check(self.motion, newest, now)
@@ -278,14 +278,15 @@ class ControlLoop:
         """Describe which input or inference is overdue; empty if none is."""
         if problem := self.obstacle or self._observer.image_problem(now, self.safety.image_age):
             return problem
-        if old := self._joints_problem(newest, now):
+        if old := self._joints_problem(now):
             return old
         if self._pending is not None and now - self._pending.since > self.safety.inference:
             return f"inference takes longer than {self.safety.inference} s"
         return ""
 
-    def _joints_problem(self, newest: Measured | None, now: float) -> str:
-        """Say that the newest joint state is too old; empty if it is not."""
+    def _joints_problem(self, now: float) -> str:
+        """Say that the newest joint state is too old, or that there is none; empty if it is recent."""
+        newest = self._observer.newest
         recent = newest is not None and now - newest.at <= self.safety.joints_age
         return "" if recent else f"the newest joint state is older than {self.safety.joints_age} s"
 

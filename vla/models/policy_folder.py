@@ -98,6 +98,7 @@ class SavedPolicy:
             UserError: they belong to another model, or a trunk of it is not here.
         """
         state = self.state if state is None else state
+        own = {*state}  # and not the weights of a trunk, which lie elsewhere
         require_trunks(model, self.training.trunks, self.folder)
         try:
             state = whole_state(model, state, self.training.trunks)
@@ -106,7 +107,7 @@ class SavedPolicy:
             for name, value in (*model.named_parameters(), *model.named_buffers()):
                 if name in state and state[name].dtype != value.dtype:
                     raise UserError(f"{name} has numbers of {state[name].dtype}, not {value.dtype}")
-                if name in state and value.is_floating_point() and not value.isfinite().all():
+                if name in own and value.is_floating_point() and not value.isfinite().all():
                     raise UserError(f"{name} has numbers that are not finite")
         except Exception as error:  # whatever modules raise for a state that is not theirs
             first = lines_of(error)[-1].strip()[:200]

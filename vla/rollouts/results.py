@@ -193,7 +193,8 @@ class Report:
 
     def _matching(self, patterns: Sequence[str]) -> list[str]:
         """Return the tasks with names such as `patterns`, in which * stands for any text."""
-        return [task for task in self.tasks if any(fnmatchcase(task, pattern) for pattern in patterns)]
+        names = {result.task for result in self.results}
+        return [task for task in names if any(fnmatchcase(task, pattern) for pattern in patterns)]
 
     def _part(self, tasks: Sequence[str], tiers: Mapping[str, Sequence[str]] | None = None) -> Report:
         results = tuple(result for result in self.results if result.task in tasks)
@@ -225,7 +226,8 @@ class Report:
     def mean_label(self) -> str:
         """Name of `mean_over_tiers`, which says so if tasks of the tiers are missing from it."""
         listed = {task for tasks in self.tiers.values() for task in tasks}
-        known = sum(any(self.tasks[task].episodes for task in self._matching([name])) for name in listed)
+        played = {result.task for result in self.results if result.outcome != ERROR}
+        known = sum(any(fnmatchcase(task, name) for task in played) for name in listed)
         return "mean over tiers" if known == len(listed) else f"mean over tiers ({known} of {len(listed)} tasks)"
 
     def __str__(self) -> str:
