@@ -75,3 +75,10 @@ def test_differences_from_the_default_show_resolved_values() -> None:
     assert changes["collect.episodes"]["here"] == 7
     tint = changes["evaluate.conditions.light_intensity_wide"]["here"]["randomize"]["light"]["tint"]
     assert tint == cfg.task.randomize.light.tint and "${" not in str(changes)  # an interpolation
+
+
+def test_settings_that_only_the_class_of_the_default_has_are_no_differences() -> None:
+    changes = {
+        each["key"]: each for each in Experiment.of(composed("model/image=film_efficientnet"), composed()).changes
+    }
+    assert "model.image._target_" in changes and "-" not in [each["here"] for each in changes.values()]

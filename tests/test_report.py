@@ -76,6 +76,12 @@ def test_rates_share_a_scale_that_shows_their_intervals(tmp_path: Path, figures:
     assert {axes.get_ylim() for axes in panels} == {(0.9, 1.0)}
 
 
+def test_success_without_a_failure_depends_on_nothing(tmp_path: Path, figures: list[Figure]) -> None:
+    played = [Result(FIRST_SEED + index, "success", draws={"even": index % 2}) for index in range(20)]
+    plot_report(Report(tuple(played)), tmp_path / "report.png")
+    assert len(figures[0].axes) == 2
+
+
 def test_texts_of_a_page_are_left_to_the_fonts_of_the_browser(tmp_path: Path) -> None:
     chinese = "拿起红色方块"
     assert f">{chinese}<" in svgs({"": lambda axes: axes.text(0, 0, chinese)})[""]

@@ -59,6 +59,7 @@ class Experiment:
             if not at(here, key) == at(there, key) != ABSENT  # else one is an interpolation of the same value
             and key.rpartition(".")[2] != SECRET
             and not key.startswith("chosen.")  # names of options, whose values are compared
+            and not (value == ABSENT and _class_differs(key, here, there))  # settings of the default's class
         ]
         return cls(here, _without_secrets(changes))
 
@@ -242,6 +243,12 @@ class Experiment:
         windows = {"history": history, "chunk": chunk, "tokenize": tokenize}
         episodes = {"episodes": self.collect.episodes, "more": self.collect.more or ()}
         return self.build("data", folder=store.folder, spec=store.spec, **windows, **episodes)
+
+
+def _class_differs(key: str, here: Node, there: Node) -> bool:
+    """Return whether the node that has a dotted key is built from another class in one of two configs."""
+    target = f"{key.rpartition('.')[0]}._target_"
+    return at(here, target) != at(there, target)
 
 
 def _without_secrets(values: Any) -> Any:

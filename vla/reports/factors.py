@@ -62,20 +62,21 @@ def groups(values: Sequence[Any]) -> list[list[int]]:
 
 
 def association(values: Sequence[Any], played: Sequence[Result]) -> float:
-    """Association of success with a factor: Pearson's χ² per degree of freedom, about 1 by chance."""
+    """Association of success, which must vary, with a factor: Pearson's χ² per degree of freedom, about 1 by chance."""
     good = np.array([result.success for result in played], dtype=float)
     rate, split = good.mean(), groups(values)
-    if rate in (0.0, 1.0):
-        return 0.0
     squares = sum(len(group) * (good[group].mean() - rate) ** 2 for group in split)
     return float(squares / (rate * (1 - rate)) / (len(split) - 1))
 
 
 def episode_panels(report: Report) -> Panels:
-    """Return panels of outcomes, lengths, and success over the factors with the strongest association."""
+    """Return panels of outcomes, lengths, and success over the factors with the strongest association.
+
+    Factors are left out if all episodes succeeded, or none.
+    """
     played = [result for result in report.results if result.outcome != ERROR]
-    ordered = sorted(factors(played).items(), key=lambda factor: -association(factor[1], played))
-    shown = dict(ordered[:FACTORS])
+    varied = factors(played) if len({result.success for result in played}) > 1 else {}
+    shown = dict(sorted(varied.items(), key=lambda factor: -association(factor[1], played))[:FACTORS])
     rates = {name: _rates_of(values, played) for name, values in shown.items() if not isinstance(values[0], tuple)}
     limits = rate_limits(min((low for each in rates.values() for _, low, _ in each), default=0.0))  # shared
     outcomes = {in_words(name): count for name, count in report.outcome_counts.items()}

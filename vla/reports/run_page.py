@@ -120,7 +120,8 @@ def _rollouts(run: Run) -> Section:
         ]
         facts["recording"] = links({RECORDING: RECORDING}) + f" has {' and '.join(counts)}; rerun {RECORDING} plays it"
         policy = f"checkpoint={_near(Path(run.report.checkpoint))} " if run.report.checkpoint else ""
-        facts["another one"] = f"{policy}evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
+        command = f"python -m vla.run {policy}evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
+        facts["record another"] = command
     moving = shown(each for each in results if each.seed in pictures)
     return Section("Rollouts", ROLLOUTS, facts, rollouts=[(each, pictures[each.seed]) for each in moving])
 
