@@ -76,9 +76,13 @@ def test_a_chunk_counts_as_a_whole() -> None:
     assert counted[0].sum() == (tokens[0] != tokenizer.end).sum() + 1 and not counted[1:].any()
 
 
-def test_too_few_tokens_and_chunks_of_another_length_are_refused() -> None:
-    with pytest.raises(UserError, match=r"more than tokenizer\.bins=8 can tell apart"):
-        Fast(bins=8, spec=SPEC, statistics=MOTIONS, scale=10.0, chunk=8)
+@pytest.mark.parametrize(("bins", "scale", "most"), [(8, 10.0, 7), (1024, 1e6, 1023), (65536, 1e5, 55040)])
+def test_more_values_than_there_are_tokens_or_characters_are_refused(bins: int, scale: float, most: int) -> None:
+    with pytest.raises(UserError, match=rf"tokenizer\.bins={bins} can tell {most} apart: .*lower tokenizer\.scale"):
+        Fast(bins=bins, spec=SPEC, statistics=MOTIONS, scale=scale, chunk=8)
+
+
+def test_chunks_of_another_length_are_refused() -> None:
     with pytest.raises(UserError, match=r"predicts 4 actions, its tokenizer 8: set tokenizer\.chunk=4"):
         TOKENIZER.length(4)
 

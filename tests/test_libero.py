@@ -173,6 +173,14 @@ def test_the_planner_turns_on_the_stove_and_its_burner_lights_up() -> None:
     assert lit > dark + 20
 
 
+def test_a_knob_at_zero_is_not_off_and_the_planner_turns_it_further() -> None:
+    with closing(world("task.suite=goal_task", "task.tasks=[7]")) as environment, environment.blind():
+        environment.reset(FIRST_SEED)
+        environment.step(np.zeros(7))
+        assert environment.outcome == "timeout"
+        solved(environment, FIRST_SEED)
+
+
 @pytest.mark.parametrize("name", ["goal 0", "object 3", "spatial 0"])  # a drawer, a bottle, a bowl by its rim
 def test_the_planner_solves(name: str) -> None:
     suite, number = name.split()

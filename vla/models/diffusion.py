@@ -18,7 +18,7 @@ from vla.models.denoiser import Denoise, DenoisingModel
 LEVELS = 100  # noise levels of training
 START = 90  # first level of sampling: 2 % of the variance is signal; higher levels carry no information
 OFFSET = 0.008  # of the cosine schedule, for some noise at level 0
-MIN_ALPHA_BAR = 2.5e-7  # as if no step removed more than 0.999 of the variance
+MIN_ALPHA_BAR = 2.5e-7  # about as if no step removed more than 0.999 of the variance
 
 
 class Diffusion(DenoisingModel):

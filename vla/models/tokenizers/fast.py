@@ -20,7 +20,8 @@ from vla.io.types import Bins, Positive, Steps
 from vla.models.tokenizers.tokenizer import MIN_SPAN, ActionStatistics, ActionTokenizer, data_bounds
 from vla.spec import Spec
 
-FIRST_CODE_POINT = 0x100  # of the smallest coefficient; below 0xD800 every code point is a character
+FIRST_CODE_POINT = 0x100  # of the smallest coefficient
+MOST_VALUES = 0xD800 - FIRST_CODE_POINT  # of coefficients; below 0xD800 every code point is a character
 END = "<end>"
 QUANTILES = (0.01, 0.99)  # of the data, scaled to -1 and 1
 
@@ -127,12 +128,13 @@ class Fast(ActionTokenizer):
     def _fit(self, chunks: Tensor) -> None:
         coefficients = self._round(chunks)
         self._least, self._most = int(coefficients.min()), int(coefficients.max())
-        alphabet = [chr(FIRST_CODE_POINT + number) for number in range(self._most - self._least + 1)]
-        if len(alphabet) >= self.bins:
+        values = self._most - self._least + 1
+        if values > (most := min(self.bins - 1, MOST_VALUES)):
             raise UserError(
-                f"the coefficients take {len(alphabet)} values, more than tokenizer.bins={self.bins} can tell apart: "
+                f"the coefficients take {values} values, and tokenizer.bins={self.bins} can tell {most} apart: "
                 f"raise it, or lower tokenizer.scale={self.scale}"
             )
+        alphabet = [chr(FIRST_CODE_POINT + number) for number in range(values)]
         bpe = Tokenizer(BPE())
         trainer = BpeTrainer(vocab_size=self.bins, special_tokens=[END], initial_alphabet=alphabet, show_progress=False)
         bpe.train_from_iterator(self._texts(coefficients), trainer)

@@ -18,7 +18,7 @@ from vla.io.types import Kernels, Widths
 POSITION_SCALE = 4.0  # of keypoint positions; large, because a hundredth of the image matters
 BRIGHTNESS_OFFSET = 0.1  # of a brightness up to 3; suppresses the chromaticity of darker colours
 INITIAL_CONTRAST = 2.0  # standard deviation of the scores of a token or keypoint; a few of 576 positions dominate
-GELU_STD = 0.35  # standard deviation of the output of TokenLearner's first layer at initialisation
+GELU_STD = 0.35  # about the standard deviation of the output of TokenLearner's first layer at initialisation
 MIN_SCORE_STD = 1e-3
 DARK = 0.05  # pixel value below which the logarithm of `log_pixels` becomes linear, so that noise in black stays small
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from vla.spec import Array
 
-# robosuite/controllers/config/osc_pose.json and robosuite/models/robots/manipulators/panda_robot.py
+# robosuite/controllers/config/osc_pose.json, robosuite/models/grippers/panda_gripper.py, and for the posture, which is
+# another than robosuite's, libero/envs/robots/mounted_panda.py
 HOME = np.array([0, -0.161037389, 0, -2.44459747, 0, 2.2267522, np.pi / 4])  # where the null space pulls to [rad]
 STIFFNESS, POSTURE = 150.0, 10.0  # of the hand and of the null space [1/s²]; both damped critically
 DAMPING, POSTURE_DAMPING = 2 * np.sqrt(STIFFNESS), 2 * np.sqrt(POSTURE)

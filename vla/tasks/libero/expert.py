@@ -18,7 +18,7 @@ from vla.tasks.libero.grasps import choose_grasp, room_of
 from vla.tasks.libero.package import ALL, tasks_of
 from vla.tasks.libero.places import in_the_way, place_of
 from vla.tasks.libero.situation import HELD, THIN, Situation
-from vla.tasks.libero.skills import approach, carry, command, drag, let_go, pull, push, twist, withdraw
+from vla.tasks.libero.skills import TWIST, approach, carry, command, drag, let_go, pull, push, twist, withdraw
 
 DRAWERS = ("wooden_cabinet", "white_cabinet", "yellow_cabinet")  # what must be open for something to be put in
 HOLLOWS = (*DRAWERS, "microwave")  # into which things are brought all the way
@@ -90,8 +90,8 @@ def decide(at: Situation) -> Array:
         return pull(at, part[1])
     if not at.upright:
         return withdraw(at)
-    if part[0] == "turnon":
-        return twist(at, part[1])
+    if part[0] in ("turnon", "turnoff"):
+        return twist(at, part[1], TWIST if part[0] == "turnon" else -TWIST)
     if part[0] == "close":
         return push(at, part[1])
     return _deliver(at, part[1], part[2], part[1] == held)

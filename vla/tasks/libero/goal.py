@@ -16,8 +16,7 @@ DOORS = {
     **{f"{colour}_cabinet": CABINET for colour in ("wooden", "white", "yellow")},
     "microwave": (-1.3, -0.005),
 }
-STOVE_ON = 0.5  # turn of the knob [rad]
-STOVE_OFF = 0.005
+STOVE_ON, STOVE_OFF = 0.5, 0.0  # turn of the knob at which it is on, and below which it is off: not yet at 0 [rad]
 NEAR = 0.03  # largest distance from the middle of a thing to lie on [m]
 OVER = (-0.005, 0.10)  # height over the upper side of a region to lie on [m]
 SLACK = 0.01  # depth under the box of a region to lie in [m]

@@ -28,6 +28,7 @@ BACK = 0.5  # lean of a hand that pushes [rad]
 EMPTY = 0.01  # largest distance of the fingers at which nothing worth keeping is between them [m]
 STRAIGHT = 0.97  # least cosine of the tilt of a thing that is let go
 RESTS = 0.12  # height over its place at which a thing is let go if it lies on something there [m]
+TWIST = 0.4  # by which the hand is ahead of a knob that it turns on [rad]
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -177,15 +178,15 @@ def pull(at: Situation, place: str) -> Array:
     return move(at, middle + np.clip(before - FUNNEL * room, 0.0, 0.11) * way, rotation, -1.0)
 
 
-def twist(at: Situation, thing: str) -> Array:
-    """Turn a knob: grasp it from above across its narrow side, and turn the hand."""
+def twist(at: Situation, thing: str, turn: float) -> Array:
+    """Turn a knob: grasp it from above across its narrow side, and turn the hand by `turn` [rad]."""
     joint = int(at.goal.joints(thing)[0])
     moving = at.moving(joint)
     grasp = min(parts(moving, alone=False), key=lambda one: one[0] + 0.02 * abs(at.turn_to(one[1].yaw)))[1]
     grasp = Grasp(np.array([*at.data.xanchor[joint][:2], grasp.position[2]]), grasp.yaw)
     holds = at.opening < FIRM and at.gap > THIN and np.linalg.norm(at.hand - grasp.position) < 3 * NEAR
     if holds:
-        return command(at, grasp.position, at.yaw + 0.4, 1.0)
+        return command(at, grasp.position, at.yaw + turn, 1.0)
     return approach(at, grasp, np.concatenate(moving), thing)
 
 
