@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +20,9 @@ from vla.config.build import build
 from vla.config.experiment import plain
 from vla.deploy.bag_import import BagDemonstrations, _Bag, _Picture, _Segment
 from vla.deploy.observer import Measured
+from vla.deploy.record import BagRecorder
 from vla.deploy.settings import Topics
+from vla.io.errors import UserError
 from vla.spec import Episode
 
 TOPICS = Topics(dict(bags.IMAGES), "/joint_states", "/words", "/commands", None, None)
@@ -103,6 +106,16 @@ def test_joint_positions_of_any_robot_are_learned_from_a_bag_alone(bag: Path) ->
     degrees = replace(spec, units=("deg",) * len(spec.action))
     with pytest.raises(ValueError, match=r"does not match the task: .* \(other units, or absolute\?\)"):
         build(config["expert"], "expert", spec=degrees)
+
+
+def test_without_rosbags_a_sentence_says_what_to_install(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    for work in (lambda: imported(bag), lambda: BagRecorder(None, tmp_path / "new")):
+        with pytest.raises(UserError, match=r"pip install 'rosbags"):
+            work()
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(

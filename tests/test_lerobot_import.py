@@ -362,6 +362,14 @@ def test_differences_from_the_task_are_named(home: Path, spec: Spec, says: str) 
         demonstrations(home / "dataset", spec)
 
 
+def test_components_of_other_names_are_taken_in_their_order_if_asked(home: Path) -> None:
+    spec = replace(ARM_SPEC, action=("east", "north", "grip"))
+    with pytest.raises(UserError, match=r"the task has 3 \(east, north, grip\): expert\.in_order=true takes them"):
+        demonstrations(home / "dataset", spec)
+    plain, renamed = demonstrations(home / "dataset", ARM_SPEC), demonstrations(home / "dataset", spec, in_order=True)
+    np.testing.assert_array_equal(renamed.numbers(1)[2], plain.numbers(1)[2])
+
+
 def test_what_fits_the_task_nearly_is_taken_and_a_whole_picture_is_no_part_of_one(home: Path) -> None:
     cut = replace(ARM_SPEC, parts=(Part("wrist"),))
     for spec in (replace(ARM_SPEC, control_hz=9.99), cut):  # images of the size of the task were cut

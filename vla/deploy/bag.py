@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,26 +17,32 @@ from vla.io.files import require_file
 DESCRIPTION = "metadata.yaml"  # of a bag
 
 
+def rosbags(module: str) -> Any:
+    """Import a module of the package rosbags; raise a UserError if that is not installed."""
+    try:
+        return import_module(f"rosbags.{module}")
+    except ModuleNotFoundError as error:
+        raise UserError("bags need a package that is not installed here: pip install 'rosbags<0.12'") from error
+
+
 @cache
 def message_types() -> Any:
     """Return the message types of ROS 2 Jazzy, as `rosbags` knows them."""
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS2_JAZZY)
+    types = rosbags("typesys")
+    return types.get_typestore(types.Stores.ROS2_JAZZY)
 
 
 @contextmanager
 def opened(folder: Path) -> Iterator[Any]:
     """Open a reader of the bag in a folder; raise a UserError if it is none, or damaged."""
-    from rosbags.rosbag2 import Reader
-
+    make_reader = rosbags("rosbag2").Reader
     if not (folder / DESCRIPTION).is_file():
         raise UserError(f"{folder} is not a bag: it has no {DESCRIPTION}")
     read_yaml(folder / DESCRIPTION, dict[str, Any])  # rosbags limits neither its size nor its depth
     for path in folder.iterdir():
         require_file(path)
     with bag_errors(folder):
-        reader = Reader(folder)
+        reader = make_reader(folder)
         reader.open()
     try:
         yield reader

@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from vla.deploy.bag import message_types
+from vla.deploy.bag import message_types, rosbags
 from vla.deploy.ros import NETWORKS, command_node, spin
 from vla.io.errors import UserError
 
@@ -30,15 +30,14 @@ class BagRecorder:
         """Args: the node that subscribes, which the caller spins; the folder of the bag, which must not exist.
 
         Raises:
-            UserError: the folder exists.
+            UserError: the folder exists, or rosbags is not installed.
         """
-        from rosbags.rosbag2 import StoragePlugin, Writer
-
+        bags = rosbags("rosbag2")
         if folder.exists():
             raise UserError(f"{folder} exists already: choose another folder")
         folder.parent.mkdir(parents=True, exist_ok=True)
         self._node, self._folder, self.messages = node, folder, 0
-        self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+        self._writer = bags.Writer(folder, version=9, storage_plugin=bags.StoragePlugin.MCAP)
         self._writer.open()
         self._known, self._subscriptions = set[str](), list[Any]()
         self._discover()

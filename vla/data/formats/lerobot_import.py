@@ -45,7 +45,7 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
 
     Args:
         folder: of the dataset.
-        images: camera → key of its images; None: `observation.images.CAMERA`.
+        images: camera → key of its images; None: `observation.images.CAMERA` or `observation.CAMERA`.
         state, action: keys of the features that hold the components, which are found by name.
         every: keep every n-th frame with the last of n actions, which suits absolute actions only.
         scale: action component → factor on the dataset's actions, also the executed ones; None: 1.
@@ -176,7 +176,8 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         ):
             if any(name not in places for name in ours):
                 theirs = f"{kind} of {len(places)} numbers ({_shortened(places)})"
-                yield f"{theirs}, the task has {len(ours)} ({_shortened(ours)})"
+                in_order = ": expert.in_order=true takes them in their order" if len(places) == len(ours) else ""
+                yield f"{theirs}, the task has {len(ours)} ({_shortened(ours)}){in_order}"
 
     def _states(self, rows: Array) -> Array:
         """Return the state in the rows of an episode, (N, P) float32; unknown velocities are differences."""
