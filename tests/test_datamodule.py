@@ -184,3 +184,12 @@ def test_what_cannot_be_trained_on_is_refused(folder: Path) -> None:
         windows(folder, spec=replace(toy.SPEC, control_hz=5.0))
     with pytest.raises(ValueError, match=r"1 episodes leave 0 for training and 1 for .*: raise collect\.episodes"):
         windows(folder, episodes=1)
+
+
+def test_a_training_goes_on_with_batches_of_its_size_alone(folder: Path) -> None:
+    module = windows(folder, batch_size=4)
+    saved = module.state_dict()
+    for known in (saved, {"windows": saved["windows"]}):  # of before batches were saved
+        module.load_state_dict(known)
+    with pytest.raises(ValueError, match="had batches of 8 windows, and 1 processes have batches of 4"):
+        module.load_state_dict({**saved, "batch": 8})

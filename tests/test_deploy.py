@@ -222,6 +222,17 @@ def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monk
     assert (report["successes"], report["episodes"], report["errors"], report["seeds"]) == (1, 1, 1, [5, 6])
 
 
+def test_a_loop_that_is_interrupted_before_an_episode_is_over_leaves_no_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (stopped := threading.Event()).set()
+    operator = SimpleNamespace(stopped=stopped, values={})
+    monkeypatch.setattr(Loop, "running", lambda loop: nullcontext(operator))
+    agent = ("agent=remote", "agent.url=ws://127.0.0.1:1")
+    job.run(Experiment.of(composed("job=deploy", "deploy=loop", *agent, f"output={tmp_path}")))
+    assert not [*tmp_path.iterdir()]
+
+
 def learn_from_the_bag(home: Path) -> None:
     """The other two commands of docs/ros2.md, after the one that recorded."""
     bag = ("expert=bag", "expert.folder=loop/bag", "collect.folder=lessons")

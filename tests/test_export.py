@@ -100,8 +100,10 @@ def test_a_resumed_export_keeps_the_videos_that_it_has(tmp_path: Path, monkeypat
         patch.setattr("vla.data.formats.lerobot_export.write_rows", Mock(side_effect=KeyboardInterrupt))
         exporter("lerobot", tmp_path / "dataset").export(store)
     begun = {path.parts[-3]: path.stat().st_mtime_ns for path in tmp_path.glob(".dataset.unfinished/**/*.mp4")}
+    (tmp_path / ".dataset.unfinished/dataset/meta/.1f.stats.json").write_text("{")  # a process was killed in there
     folder = exporter("lerobot", tmp_path / "dataset").export(store)
     assert begun == {path.parts[-3]: path.stat().st_mtime_ns for path in folder.rglob("*.mp4")} != {}
+    assert content(folder) == content(exporter("lerobot", tmp_path / "whole").export(store))
 
 
 EXPORT = """

@@ -25,6 +25,15 @@ def test_a_file_and_a_folder_take_their_place_at_the_end(tmp_path: Path) -> None
     assert (tmp_path / "folder/inside").read_text() == "folder"
 
 
+def test_processes_of_one_number_write_one_folder(tmp_path: Path) -> None:
+    # Such as those of containers, also one that was killed.
+    with atomic_path(tmp_path / "folder") as one, atomic_path(tmp_path / "folder") as other:
+        for draft in (one, other):
+            draft.mkdir()
+            (draft / "file").write_text(draft.name)
+    assert [path.read_text() for path in tmp_path.rglob("file")] == [one.name]
+
+
 @pytest.mark.parametrize("before", ["", "before"])
 def test_a_full_disk_leaves_what_was_there_and_is_named(tmp_path: Path, before: str) -> None:
     target = tmp_path / "file"

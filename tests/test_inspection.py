@@ -24,6 +24,7 @@ from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
 from vla.data.index import listed
 from vla.data.verification import find_episode, require_whole, verify_store
+from vla.io.errors import UserError
 from vla.jobs.inspect import inspect_store, replay_episode
 from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
@@ -216,6 +217,20 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path: Path) -> None:
     (store.folder / "index.jsonl").unlink()
     with pytest.raises(ValueError, match=r"index\.jsonl is missing, which .* beside it needs: copy the folder again"):
         EpisodeStore(store.folder)
+
+
+def test_two_processes_do_not_write_one_new_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = add(tmp_path / "store", EPISODES)
+
+    def meanwhile(items: list[Any], description: str) -> list[Any]:
+        with pytest.raises(UserError, match=r"another process writes .*new: wait for it"):
+            derive_store([store], tmp_path / "inner/new")
+        return items
+
+    monkeypatch.setattr("vla.data.derivation.track", meanwhile)
+    derive_store([store], tmp_path / "inner/new")
+    assert verify_store(EpisodeStore(tmp_path / "inner/new")).whole == store.episodes
+    assert [path.name for path in (tmp_path / "inner").iterdir()] == ["new"]
 
 
 def test_a_seed_that_is_not_there_is_named(tmp_path: Path) -> None:

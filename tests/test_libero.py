@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from composing import composed
 from replaying import played, same
+from toy_episodes import full_disk
 
 from vla.config.experiment import Experiment
 from vla.io.errors import UserError
@@ -152,6 +153,12 @@ def test_a_scene_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     name = tasks_of("object")[0].scene
     first = scene.load_scene(name, (), None)
+    monkeypatch.chdir(tmp_path)  # where MuJoCo logs warnings
+    (file,) = tmp_path.rglob("*.mjb")
+    file.write_bytes(file.read_bytes()[:-1])  # damage is no reason to end
+    scene.load_scene(name, (), None)
+    with full_disk(1000), pytest.raises(OSError, match="File too large"):
+        scene.save_model(first, tmp_path / "half.mjb")
     monkeypatch.setattr(scene, "_light", None)
     assert np.array_equal(first.body_mass, scene.load_scene(name, (), None).body_mass)
 

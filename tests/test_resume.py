@@ -98,6 +98,19 @@ def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: b
             training_progress(tmp_path, plain(composed(other)))
 
 
+def test_a_finished_training_needs_no_checkpoint(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    save_policy(tmp_path / "policy", plain(composed()), global_step=2000)
+    done = (None, tmp_path / "policy")
+    assert training_progress(tmp_path, plain(composed())) == done and not caplog.records
+    with caplog.at_level("WARNING"):
+        assert training_progress(tmp_path, plain(composed("trainer.max_steps=1000"))) == done
+    assert "was trained for 2000 steps, more than trainer.max_steps" in caplog.text
+    with pytest.raises(ValueError, match=r"differs in model\.width: choose another output=DIR"):
+        training_progress(tmp_path, plain(composed("model.width=17")))
+    with pytest.raises(ValueError, match=r"last\.ckpt is gone, with which a longer training would continue: choose"):
+        training_progress(tmp_path, plain(composed("trainer.max_steps=3000")))
+
+
 def test_a_report_of_older_weights_or_compared_with_an_older_run_is_not_this_one(tmp_path: Path) -> None:
     policy, other, replayed = (tmp_path / name for name in ("policy", "other/report.json", "store/index.jsonl"))
     for file in (other, replayed):
@@ -107,8 +120,9 @@ def test_a_report_of_older_weights_or_compared_with_an_older_run_is_not_this_one
     for changed in (policy, other, replayed):
         for file in (policy, other, replayed):
             file.touch()
-        write_report(report, tmp_path / "report.json", str(policy), asked)
-        assert cached_success(tmp_path, asked, policy) == 0.5
-        assert cached_success(tmp_path, plain(composed("evaluate.episodes=9")), policy) is None
+        write_report(report, tmp_path / "report.json", str(policy), asked, {"weights": "1"})
+        assert cached_success(tmp_path, asked, policy, "1") == 0.5
+        assert cached_success(tmp_path, plain(composed("evaluate.episodes=9")), policy, "1") is None
+        assert cached_success(tmp_path, asked, policy, "2") is None  # copied here with its date
         os.utime(changed, (time.time() + 10, time.time() + 10))
-        assert cached_success(tmp_path, asked, policy) is None
+        assert cached_success(tmp_path, asked, policy, "1") is None

@@ -26,11 +26,13 @@ from collecting import until
 from command_line import SMALL, here, vla
 from PIL import Image
 from rerun.chunk import RrdReader
+from saved_policies import change_json
 from websockets.sync.client import connect
 
 from vla import jobs
 from vla.data.episodes import EpisodeStore
 from vla.io.array_messages import pack
+from vla.jobs import evaluate
 from vla.models.policy_folder import read_policy
 from vla.rollouts.results import recording_name
 from vla.tasks.rendering.fast import Fast
@@ -228,7 +230,31 @@ def test_the_same_command_in_the_same_folder_does_nothing_twice(home: Path) -> N
     evaluation = ("checkpoint=copy", "evaluate.episodes=1", "recorder=none", "output=alone")
     assert "wrote alone/report.html" in here(home, *evaluation).stdout
     assert "${" not in (home / "alone/changes.yaml").read_text()
+    (home / "alone/report.html").unlink()  # the process was killed before it was written
     assert "evaluation is already finished" in here(home, *evaluation).stdout
+    page = home / "alone/report.html"
+    assert "95 % CI" in page.read_text()
+    os.utime(page, (0, 0))
+    here(home, *evaluation)
+    assert page.stat().st_mtime > 0
+
+
+def test_a_policy_that_is_replaced_while_it_is_evaluated_gets_no_report(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(home / "run/policy", home / "replaced")
+    play = evaluate._play
+
+    def replaced(*arguments: Any) -> dict[str, Any]:
+        reports = play(*arguments)
+        change_json(home / "replaced/training.json", lambda training: {**training, "weights": "0" * 64})
+        return reports
+
+    monkeypatch.setattr(evaluate, "_play", replaced)
+    asked = ("checkpoint=replaced", "evaluate.episodes=1", "recorder=none", "cluster.workers=1", "output=of_both")
+    refused = here(home, *asked, ok=False)
+    assert "replaced was replaced while it was evaluated: run the evaluation again" in refused.stderr
+    assert not (home / "of_both/report.json").exists()
 
 
 def test_a_training_that_cannot_be_resumed_stays_as_it_was(home: Path) -> None:

@@ -34,6 +34,7 @@ from tiny_vla import (
     steps,
     write_tokenizer,
 )
+from toy_episodes import full_disk
 
 from vla.io.errors import UserError
 from vla.models.learner import Learner
@@ -237,6 +238,12 @@ def test_what_lerobot_cannot_build_is_not_exported(tmp_path: Path, tokenizer: Pa
         LeRobotPolicyExporter(tmp_path / "published").export(as_policy(model, SPEC))
     with pytest.raises(UserError, match=r"reads a sentence with a tokenizer: train with model\.text\.name"):
         LeRobotPolicyExporter(tmp_path / "published").export(as_policy(make_smolvla(), SPEC))
+    assert not [*tmp_path.iterdir()]
+
+
+def test_weights_without_room_are_no_policy_of_lerobot(tmp_path: Path, tokenizer: Path) -> None:
+    with full_disk(1000), pytest.raises(UserError, match=r"published cannot be written \(.*File too large"):
+        LeRobotPolicyExporter(tmp_path / "published").export(as_policy(make_smolvla(tokenizer), SPEC))
     assert not [*tmp_path.iterdir()]
 
 

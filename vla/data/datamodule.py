@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from lightning import LightningDataModule
@@ -159,12 +160,18 @@ class WindowDataModule(LightningDataModule):
         layout = self._history, self._chunk, self._on_gpu(), self._spec.truth_size
         self.make_batch = JoinedBatcher([WindowBatcher(store, *layout) for store in stores], rows)
 
-    def state_dict(self) -> dict[str, str]:
-        """Return a digest of the demonstrations, which is saved with checkpoints."""
-        return {"windows": self._digest}
+    def state_dict(self) -> dict[str, Any]:
+        """Return a digest of the demonstrations and the size of a batch over all processes, saved with checkpoints."""
+        return {"windows": self._digest, "batch": self.batch_size * self._place()[1]}
 
-    def load_state_dict(self, state: dict[str, str]) -> None:
-        """Raise a UserError unless the demonstrations are those of the resumed training."""
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Raise a UserError unless demonstrations and batches are those of the resumed training."""
+        batch = self.batch_size * self._place()[1]
+        if (before := state.get("batch", batch)) != batch:
+            raise UserError(
+                f"the resumed training had batches of {before} windows, and {self._place()[1]} processes have batches "
+                f"of {batch}: train on as many devices as before"
+            )
         if state["windows"] != self._digest:
             raise UserError(
                 f"the resumed training was started with other demonstrations than those in {self._folder}: "

@@ -19,6 +19,7 @@ from vla.data.header import Codec
 from vla.data.index import DAMAGED, LOST, Entry
 from vla.data.verification import entries_by_config, episode_of, without_rows
 from vla.io.errors import UserError
+from vla.io.files import locked
 from vla.io.printable import track
 
 Copies = Sequence[tuple[EpisodeStore, Entry]]  # of one seed and config
@@ -29,7 +30,7 @@ def derive_store(
     stores: Sequence[EpisodeStore], folder: Path, where: Mapping[str, Any] | None = None, repair: bool = False
 ) -> list[int]:
     """Write a new store of the episodes in others of the same spec that match `where`, atomically (UserError: the
-    folder exists, specs differ, nothing matches, or an episode is damaged).
+    folder exists, or another process writes it; specs differ, nothing matches, or an episode is damaged).
 
     Seeds are in order, config by config. Of the same seed and config one undamaged episode is kept. If all seeds
     between the first and the last of a single config exist, the new store equals a collected one, and can grow. With
@@ -45,6 +46,9 @@ def derive_store(
         fitting = f" that fit inspect.where={dict(where)}" if where else ""
         raise UserError(f"{', '.join(str(store.folder) for store in stores)}: there are no episodes{fitting}")
     draft = folder.with_name(f".{folder.name}.draft")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    busy = f"another process writes {folder}: wait for it, or choose another inspect.into"
+    lock = locked(folder.with_name(f".{folder.name}.lock"), busy)
     shutil.rmtree(draft, ignore_errors=True)  # left by a process that was killed
     try:
         codecs = {store.codec for store in stores}
@@ -60,6 +64,9 @@ def derive_store(
             reason = f"{folder} cannot be written ({error.__cause__.strerror}), nothing of it is kept"
             raise UserError(f"{reason}: make room there, or choose another inspect.into") from error
         raise
+    finally:
+        Path(lock.lock_file).unlink(missing_ok=True)  # while it is held: who comes later makes a new one
+        lock.release()
     return damaged
 
 

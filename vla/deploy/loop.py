@@ -47,8 +47,11 @@ class Loop:
     environment: Callable[[], Environment]
     output: Path
 
-    def run(self) -> Report:
-        """Play all episodes, up to the first that ends in an error, which is raised if there is no other."""
+    def run(self) -> Report | None:
+        """Play all episodes, up to the first that ends in an error, which is raised if there is no other.
+
+        The result is None if it was interrupted before the first episode was over.
+        """
         with self.running() as operator:
             results: list[Result] = []
             log.info("playing %d episodes", self.episodes)
@@ -64,7 +67,7 @@ class Loop:
                     results.append(result)
                     log.info("seed %d: %s", result.seed, result.outcome)
             log.info("%s", ", ".join(f"{key} {value}" for key, value in operator.values.items() if "[ms]" in key))
-        return Report(tuple(results))
+        return Report(tuple(results)) if results else None
 
     @contextmanager
     def running(self) -> Iterator[DemoOperator]:

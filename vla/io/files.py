@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -33,7 +34,9 @@ def atomic_path(target: Path) -> Iterator[Path]:
     Raises:
         OSError: the draft cannot be written; the message names `target`.
     """
-    draft = target.with_name(f".{os.getpid()}.{target.name}")  # libraries choose the format by the suffix
+    # Not the number of this process: in a container it is that of a killed one, or of another machine's. Libraries
+    # choose the format by the suffix.
+    draft = target.with_name(f".{secrets.token_hex(4)}.{target.name}")
     before = draft.with_name(f"{draft.name}.before")
     try:
         with writing(target):

@@ -95,26 +95,39 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
     A finished evaluation of a policy is kept, and of an unfinished one the episodes that were played. If an episode
     ended in an error the report is written and contains it, then a UserError is raised.
     """
-    output = experiment.output
-    if checkpoint and (known := cached_success(output, experiment.config, checkpoint)) is not None:
+    output, identity = experiment.output, _identity(experiment, checkpoint)
+    weights = identity["weights"]
+    if checkpoint and (known := cached_success(output, experiment.config, checkpoint, weights)) is not None:
+        _renew_page(output)
         return known
     statements, conclusions = _statements(experiment), list[str]()
     _ = experiment.origin  # of the code that is evaluated, not of later changes
     try:
-        with Played(output, _identity(experiment, checkpoint)) as played:
+        with Played(output, identity) as played:
             with policy_for_workers(experiment, checkpoint) as make_policy:
                 reports = _play(experiment, make_policy, statements, played)
+            if checkpoint and read_policy(checkpoint).training.weights != weights:  # workers read them as they start
+                raise UserError(f"{checkpoint} was replaced while it was evaluated: run the evaluation again")
             report = reports[IN_DISTRIBUTION]
             said = [each.say(report) for each in statements]
             conclusions += [*said, str(report)]
             with writing(output / REPORT):
-                _write(experiment, checkpoint, reports, {**_facts(experiment, checkpoint), "statements": said})
+                facts = {**_facts(experiment, checkpoint), "weights": weights, "statements": said}
+                _write(experiment, checkpoint, reports, facts)
             if errors := _errors(reports):  # what was played is kept, so that the same command plays only these again
                 raise UserError(f"{errors} episodes ended in an error, see {output / REPORT}")
     finally:
         for line in conclusions:  # after whatever was logged, because scripts read the last line
             print(printable(line))
     return report.success
+
+
+def _renew_page(output: Path) -> None:
+    """Write the page of a run if it is older than the report: a process was killed between, or had no room."""
+    page = output / PAGE
+    if not page.is_file() or page.stat().st_mtime < (output / REPORT).stat().st_mtime:
+        with warn_on_error(page):
+            write_page(output)
 
 
 def _identity(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]:

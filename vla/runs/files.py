@@ -138,6 +138,7 @@ class ReportFile:
     statements: list[str] = field(default_factory=list)  # on what the evaluation was to decide
     origin: Origin | None = None
     recorded: list[int] = field(default_factory=list)  # seeds of the episodes in the recording
+    weights: str | None = None  # SHA-256 of those of the policy
 
     def __post_init__(self) -> None:
         """Require the same episodes in every part."""

@@ -14,7 +14,7 @@ from vla.config.differences import differences
 from vla.data.index import INDEX
 from vla.io.errors import UserError
 from vla.io.files import locked
-from vla.models.checkpoint import read_header
+from vla.models.checkpoint import Header, read_header
 from vla.models.policy_folder import POLICY, read_policy
 from vla.runs.folder import CHECKPOINTS, LAST, REPORT, read_report
 from vla.spec import IN_DISTRIBUTION
@@ -30,20 +30,28 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | N
     """Return how far the training got that `config` describes in a folder; a UserError if it holds another one.
 
     The first result is the checkpoint of an unfinished training, the second the folder of the policy that a finished
-    one selected; both are None before its first save.
+    one selected, which needs no checkpoint any more; both are None before its first save.
     """
     last, chosen = folder / CHECKPOINTS / LAST, folder / POLICY
-    if not last.exists():
+    if last.exists():
+        saved = read_header(last)
+    elif chosen.is_dir():
+        policy = read_policy(chosen)
+        saved = Header(policy.config, True, policy.training.steps)
+    else:
         return None, None
-    saved = read_header(last)
     require_identity(saved.config, config, folder)
     trainer, before = config["trainer"], saved.config.get("trainer", {})
     changed = any(trainer.get(name) != before.get(name) for name in LENGTHS)
     longer = changed and not 0 <= trainer["max_steps"] <= saved.steps
+    if changed and not longer and trainer["max_steps"] != saved.steps:
+        log.warning("%s was trained for %d steps, more than trainer.max_steps", folder, saved.steps)
     if saved.finished and chosen.is_dir() and not longer:
         require_identity(read_policy(chosen).config, config, folder)  # which is the one that is built
         log.info("training is already finished: %s", chosen)
         return None, chosen
+    if not last.exists():
+        raise UserError(f"{last} is gone, with which a longer training would continue: choose another output=DIR")
     if isinstance(trainer.get("strategy"), dict) and not isinstance(before.get("strategy"), dict):
         # A sharded optimiser orders its parameters differently.
         raise UserError(f"trainer=fsdp cannot continue {last}, which was trained without it: use trainer=ddp")
@@ -51,10 +59,11 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | N
     return last, None
 
 
-def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path) -> float | None:
-    """Return the success rate of a run's report if it is of the same policy and the same evaluation."""
+def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path, weights: str | None) -> float | None:
+    """Return the success rate of a run's report if it is of the same policy, with the digest `weights`, and the same
+    evaluation."""
     report = read_report(folder)
-    if report is None or report.checkpoint != str(checkpoint):
+    if report is None or report.checkpoint != str(checkpoint) or report.weights not in (None, weights):
         return None
     against, nearest = config["evaluate"]["against"], config["evaluate"]["nearest"]
     # Since the report the training may have continued, the run that it compares with have been evaluated again, or

@@ -74,6 +74,8 @@ class LeRobotExporter:
             if not _is_of(draft, source):
                 shutil.rmtree(draft, ignore_errors=True)
                 write_json(draft / "meta/vla.json", source)
+            for half in draft.rglob(".*"):  # what a killed process was writing
+                half.unlink()
             self._write(draft, store, cluster)
             os.rename(draft, self._folder)
         return self._folder

@@ -38,8 +38,9 @@ class LeRobotPolicyExporter:
         """Write a policy; returns the folder.
 
         Raises:
-            UserError: the folder exists, or LeRobot has no such policy.
+            UserError: the folder exists, LeRobot has no such policy, or there is no room for the weights.
         """
+        from safetensors import SafetensorError
         from safetensors.torch import save_file
 
         if self._folder.exists():
@@ -55,7 +56,11 @@ class LeRobotPolicyExporter:
         config, steps = _config(model), (_preprocessing(model), _postprocessing(model))
         with atomic_path(self._folder) as draft:
             draft.mkdir(parents=True)
-            save_file(weights, draft / "model.safetensors")
+            try:
+                save_file(weights, draft / "model.safetensors")
+            except SafetensorError as error:
+                where = "make room there, or choose another export.folder"
+                raise UserError(f"{self._folder} cannot be written ({error}): {where}") from error
             write_json(draft / CONFIG, config)
             for file, pipeline in zip((PREPROCESSOR, POSTPROCESSOR), steps, strict=True):
                 for step in pipeline:

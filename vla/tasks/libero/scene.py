@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import mujoco
@@ -60,15 +62,24 @@ def load_scene(name: str, things: Collection[str], detail: Detail | None) -> muj
     """
     asked = f"{METHOD} {name} {sorted(things)} {detail} {mujoco.__version__}"
     path = cache_folder().parent / "libero" / f"{hashlib.sha256(asked.encode()).hexdigest()[:24]}.mjb"
-    if not path.is_file():
-        try:
-            model = _light(scene_xml(name), things, detail)
-        except ValueError as error:
-            raise UserError(f"MuJoCo {mujoco.__version__} cannot compile a scene of LIBERO: {error}") from error
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as draft:
-            mujoco.mj_saveModel(model, str(draft))
+    if path.is_file():
+        with suppress(ValueError):  # it is damaged
+            return mujoco.MjModel.from_binary_path(str(path))
+    try:
+        model = _light(scene_xml(name), things, detail)
+    except ValueError as error:
+        raise UserError(f"MuJoCo {mujoco.__version__} cannot compile a scene of LIBERO: {error}") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as draft:
+        save_model(model, draft)
     return mujoco.MjModel.from_binary_path(str(path))
+
+
+def save_model(model: mujoco.MjModel, path: Path) -> None:
+    """Write a model; an OSError if there is no room, of which MuJoCo's own writing only warns."""
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    path.write_bytes(content.data)
 
 
 def _light(xml: str, things: Collection[str], detail: Detail | None) -> mujoco.MjModel:
