@@ -23,6 +23,7 @@ from std_srvs.srv import SetBool
 from world import TOPICS, World
 
 from vla.deploy import actions
+from vla.deploy.bag import opened
 from vla.deploy.bag_import import BagDemonstrations
 from vla.deploy.record import BagRecorder
 from vla.deploy.ros import RosNetwork
@@ -367,6 +368,18 @@ def test_what_goals_command_is_recorded_and_imported(make_world: Callable[..., W
     places = [forward(np.array(command.position[:7]))[0][0, 3] for command in world.commands]
     assert len(episode.actions) > 5 and np.abs(episode.actions[:, 1:6]).max() < 1e-3
     assert 0.5 * np.ptp(places) < episode.actions[:, 0].sum() < np.ptp(places) + 1e-3 and np.ptp(places) > 0.02
+
+
+def test_a_topic_of_an_unknown_type_does_not_end_a_recording(
+    make_world: Callable[..., World], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = make_world().node
+    kinds = {"/of_anybody": "std_msgs/msg/Nothing", "/words": "std_msgs/msg/String"}
+    topics = [(topic, [kind]) for topic, kind in kinds.items()]
+    monkeypatch.setattr(node, "get_topic_names_and_types", lambda: topics)
+    BagRecorder(node, tmp_path / "bag").close()
+    with opened(tmp_path / "bag") as reader:
+        assert [connection.topic for connection in reader.connections] == ["/words"]
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,10 @@ import pytest
 from command_line import SMALL, here
 from composing import check, composed
 
+from vla import run
 from vla.config.build import build
 from vla.config.experiment import plain
+from vla.io.errors import UserError
 from vla.tasks.gl import WORKING_BACKEND
 
 # Line → what its sentence says.
@@ -141,3 +143,10 @@ def test_without_gl_the_error_says_what_to_install(tmp_path: Path) -> None:
         text=True,
     )
     assert done.returncode == 1 and "libegl1" in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("value", ["", "x", "-1"])
+def test_a_rank_that_is_no_number_is_named(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SLURM_PROCID", value)
+    with pytest.raises(UserError, match=f"the environment variable SLURM_PROCID is '{value}', not the number"):
+        run._require_ranks()

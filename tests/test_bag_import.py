@@ -126,6 +126,7 @@ def test_without_rosbags_a_sentence_says_what_to_install(
             {"topics": replace(TOPICS, images={"front": "/commands"}), "spec": replace(SPEC, cameras=("front",))},
             "/commands can be used: they are of type sensor_msgs/msg/JointState",
         ),
+        ({"topics": replace(TOPICS, commands="/words")}, "/words can be used: they are of type std_msgs/msg/Str"),
         ({"robot": replace(ROBOT, joints=[f"fr3_joint{n}" for n in range(1, 8)])}, "lacks fr3_joint1, .* has"),
         ({"spec": replace(SPEC, robot=None)}, "expert=bag needs a robot"),
         ({"spec": replace(SPEC, cameras=("top",))}, r"no topic for the cameras top: add \+expert\.topics"),

@@ -17,6 +17,7 @@ from toy_episodes import EPISODES, add
 from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.verification import verify_store
+from vla.reports import dataset_card
 from vla.reports.dataset_card import store_table, write_card
 
 DRAWS: list[dict[str, Any]] = [
@@ -79,3 +80,11 @@ def test_a_store_that_was_put_together_says_of_what(tmp_path: Path) -> None:
     derive_store([store], tmp_path / "chosen", {"seed": [1, 2]})
     _, text = described(EpisodeStore(tmp_path / "chosen"))
     assert "Chosen by `inspect.where={'seed': [1, 2]}`." in text and "2 seeds, 1, 2:" in text
+
+
+def test_of_very_many_draws_some_are_shown(tmp_path: Path, figures: list[Figure], monkeypatch: Any) -> None:
+    monkeypatch.setattr(dataset_card, "DRAWN", 3)
+    draws = [{f"d{number}": float(seed * (number + 1)) for number in range(9)} for seed in range(5)]
+    described(add(tmp_path, [replace(each, draws=drawn) for each, drawn in zip(EPISODES, draws, strict=True)]))
+    assert {axes.get_title() for axes in figures[0].axes} >= {"d0", "d1", "d2"}
+    assert "d3" not in {axes.get_title() for axes in figures[0].axes}

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from vla.io.documents import MAX_DEPTH, STRICT, parse_json, parse_yaml, read_json, read_yaml, resolved
+from vla.io.documents import MAX_DEPTH, STRICT, parse_json, parse_yaml, read_json, read_resolved, read_yaml, resolved
 from vla.io.errors import UserError
 from vla.io.types import NonNegativeRange
 
@@ -69,6 +69,7 @@ def test_json_of_another_kind_is_refused_by_name(text: str | bytes, kind: Any, s
         ("a: [", "expected"),
         ("a: 2020-99-99", "month must be in 1..12"),
         (b"\xff", "invalid"),
+        ("a: 1" + ":1" * 500_000, "has aliases or numbers of 100 digits"),  # which take minutes
     ],
 )
 def test_yaml_that_is_not_plain_is_refused_by_name(text: str | bytes, says: str) -> None:
@@ -89,3 +90,9 @@ def test_a_configuration_out_of_a_file_is_plain_and_resolved() -> None:
     for key in (5, True, math.nan, None, 1j):
         with pytest.raises(UserError, match=f"^store.json holds the key {key}, which is no text$"):
             resolved({"a": {key: 1}}, "store.json")
+
+
+def test_half_a_character_is_refused_before_anything_is_made_of_it(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"learner": ["\\ud800"]}')
+    with pytest.raises(UserError, match=r"config\.json is damaged or of another kind: .*surrogates not allowed"):
+        read_resolved(tmp_path / "config.json")

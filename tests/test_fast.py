@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from fake_batch import Motions
+from tokenizers import Tokenizer
 from toy import SPEC
 
 from vla.io.errors import UserError
@@ -87,8 +88,20 @@ def test_chunks_of_another_length_are_refused() -> None:
         TOKENIZER.length(4)
 
 
-@pytest.mark.parametrize("change", [{"coefficients": None}, {"bpe": "{"}], ids=["coefficients", "byte pairs"])
+DAMAGED: list[dict[str, Any]] = [{"coefficients": None}, {"coefficients": [-(10**400), 1]}, {"bpe": "{"}]
+
+
+@pytest.mark.parametrize("change", DAMAGED, ids=["coefficients", "size", "byte pairs"])
 def test_a_damaged_vocabulary_is_refused(change: dict[str, Any]) -> None:
     tokenizer = Fast(spec=SPEC, bins=1024, scale=10.0, chunk=8)
     with pytest.raises(UserError, match="the tokenizer of the policy cannot be read"):
         tokenizer.set_extra_state({**TOKENIZER.get_extra_state(), **change})
+
+
+def test_a_file_does_not_lengthen_sequences() -> None:
+    tokenizer, chunks = Fast(spec=SPEC, bins=1024, scale=10.0, chunk=8), torch.from_numpy(CHUNKS.copy())
+    state, padded = TOKENIZER.get_extra_state(), Tokenizer.from_str(TOKENIZER.get_extra_state()["bpe"])
+    padded.enable_padding(length=1000)
+    tokenizer.load_state_dict(TOKENIZER.state_dict())
+    tokenizer.set_extra_state({**state, "bpe": padded.to_str()})
+    assert torch.equal(tokenizer.tokenize(chunks), TOKENIZER.tokenize(chunks))

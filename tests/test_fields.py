@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,12 +18,13 @@ from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change
 from vla.config.experiment import Experiment
 from vla.data.datamodule import digest_of
 from vla.data.derivation import derive_store
-from vla.data.episodes import EpisodeStore
+from vla.data.episodes import DamageError, EpisodeStore
 from vla.data.fields import END
 from vla.data.header import Codec
 from vla.data.image_codec import decode, encode
 from vla.data.verification import episode_of, require_whole, verify_store
 from vla.data.window_batches import WindowBatcher
+from vla.io.errors import UserError
 from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.rollouts.memorisation import NearestDemonstration
@@ -221,3 +223,26 @@ def test_what_another_process_adds_does_not_disturb_a_reader(tmp_path: Path) -> 
     add(tmp_path, EPISODES[2:], LOSSLESS)
     np.testing.assert_array_equal(rows[0 : len(rows)], before)
     assert reader.rows("rgb_front").shape == rows.shape
+
+
+def test_a_pipe_in_place_of_images_and_ends_beyond_any_file_are_told(tmp_path: Path) -> None:
+    store = add(tmp_path, EPISODES, LOSSLESS)
+    far = np.fromfile(tmp_path / "rgb_wrist.ends", END)
+    far["end"][store.tried[LATER].start :][:2] = 2**63 - 10, 2**63 + 10
+    change(tmp_path / "rgb_wrist.ends", lambda _: far.tobytes())
+    for row in range(2):
+        with pytest.raises(DamageError, match=f"rgb_wrist of step {row} of seed 1 "):
+            store.rows("rgb_wrist")[store.tried[LATER].start + row :][:1]
+    far["end"] = 0
+    change(tmp_path / "rgb_wrist.ends", lambda _: far.tobytes())
+    (tmp_path / "rgb_wrist.pack").unlink()
+    os.mkfifo(tmp_path / "rgb_wrist.pack")
+    with pytest.raises(UserError, match=r"rgb_wrist\.pack is a folder, a pipe or a device, not a file"):
+        EpisodeStore(tmp_path)
+
+
+def test_an_episode_larger_than_the_memory_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = add(tmp_path, EPISODES, LOSSLESS)
+    monkeypatch.setattr("vla.data.episodes.memory", lambda: 10**4)
+    with pytest.raises(UserError, match=r"seed 0 in .* unpacks to 0 GB, and this machine has 0 GB of memory"):
+        store.read(store.tried[0])

@@ -92,9 +92,10 @@ def test_a_model_that_the_hub_has_not_is_named(downloads: list[str]) -> None:
 
 def test_without_the_hub_the_reason_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
-    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
-    for reason in ("refused", "OFFLINE"):
+    hubs = {"here": "unknown url", "http://a b": "control", "http://127.0.0.1:9": "refused", "": "OFFLINE"}
+    for endpoint, reason in hubs.items():
+        monkeypatch.setattr(constants, "ENDPOINT", endpoint)
+        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", not endpoint)
         with pytest.raises(UserError, match=reason) as caught:
             fetch("somebody/model", "*")
         assert "\n" not in str(caught.value)
-        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)

@@ -123,6 +123,7 @@ def test_a_state_names_the_encoder_and_no_other_one_takes_its_place(folder: Path
 def test_a_configuration_cannot_make_transformers_fetch_or_run_code(folder: Path, tmp_path: Path) -> None:
     names = ("attn_implementation", "_attn_implementation", "experts_implementation")
     acting = {**dict.fromkeys(names, "somebody/kernel"), "auto_map": {"AutoModel": "own.Model"}}
+    acting["quantization_config"] = {"quant_method": "mxfp4"}  # whose code comes from the hub
     expected = HuggingFace(str(folder), width=8).tokenize(SENTENCES)
     change_json(write_encoder(tmp_path / "bert") / "config.json", lambda values: values | acting)
     assert torch.equal(HuggingFace(str(tmp_path / "bert"), width=8).tokenize(SENTENCES), expected)
@@ -157,6 +158,7 @@ def deeper(folder: Path) -> None:
         (damaged("config.json", b'{"model_type": "bret"}'), "bret"),
         (damaged("config.json", b'{"model_type": "own", "auto_map": {"AutoModel": "own.Model"}}'), "own"),
         (damaged("tokenizer.json", b'{"model": '), "Expecting value"),
+        (damaged("adapter_config.json", b"{}"), "it has an adapter"),
         (pickled, "no file named model.safetensors"),
         (deeper, r"weights are those of another network, encoder\.layer\.1\..* is missing"),
     ],

@@ -44,6 +44,7 @@ from vla.config.experiment import make_agent
 from vla.data.datamodule import held_out
 from vla.data.episodes import EpisodeStore
 from vla.data.formats import lerobot_tables as tables
+from vla.data.formats.lerobot_dataset import LeRobotDataset
 from vla.data.formats.lerobot_images import decode, encode, require_video
 from vla.data.formats.lerobot_import import LeRobotDemonstrations
 from vla.io.errors import UserError
@@ -213,6 +214,7 @@ def test_images_beside_the_tables_are_read_within_the_dataset_only(home: Path, t
 
 CELLS: dict[str, dict[str, Any]] = {
     "there is no image: correct the dataset": {"bytes": None, "path": None},
+    r"no image but the path 'ab', which is no file": {"path": "a\0b"},
     r"no image but the path 'a{200}', which is no file": {"path": "a" * 5000},
     r"cannot be decoded: it is not PNG or JPEG or WEBP$": {"bytes": b"GIF89a"},
     r"cannot be decoded \(": {"bytes": png(Image.new("RGB", (16, 16)))[:45]},
@@ -228,9 +230,10 @@ def test_images_of_another_kind_are_refused_by_name(home: Path, tmp_path: Path) 
         with pytest.raises(ValueError, match=rf"{FRONT} of episode 0, step 0: .*{says}") as caught:
             demonstrations(dataset, ARM_SPEC)
         assert "copy the dataset" not in str(caught.value)
-    column(ROWS, FRONT, "a.png")(dataset)
-    with pytest.raises(ValueError, match=rf"{ROWS}: {FRONT} does not hold images"):
-        demonstrations(dataset, ARM_SPEC)
+    for other in ("a.png", {"bytes": 5, "path": "a.png"}):
+        column(ROWS, FRONT, other)(dataset)
+        with pytest.raises(ValueError, match=rf"{ROWS}: {FRONT} does not hold images"):
+            demonstrations(dataset, ARM_SPEC)
 
 
 def test_what_other_people_leave_out_is_made_up_and_said(home: Path, tmp_path: Path) -> None:
@@ -418,6 +421,12 @@ def pipe(name: str) -> Change:
     return lambda dataset: ((dataset / name).unlink(), os.mkfifo(dataset / name))
 
 
+def listing(dataset: Path) -> None:
+    """Put a list of videos in the place of one."""
+    (dataset / MP4).rename((dataset / MP4).with_name("other.mp4"))
+    (dataset / MP4).write_text("ffconcat version 1.0\nfile other.mp4\n")
+
+
 def film(images: int, size: int, fps: int) -> Change:
     """Put another video in the place of one."""
     clip = np.zeros((images, size, size, 3), np.uint8)
@@ -450,6 +459,8 @@ REFUSED: list[tuple[Change, str]] = [
     (without(MP4), rf"lacks {MP4}: copy the dataset again"),
     *((cut_off(name), "cannot be read.*copy the dataset again") for name in (ROWS, EPISODES, TASKS)),
     (cut_off(MP4), "cannot be read as a video"),
+    (listing, "cannot be read as a video"),
+    (rows(lambda table: table.append_column("action", table["action"])), "has twice the columns action: correct"),
     *((pipe(name), f"{name} is a folder, a pipe or a device, not") for name in (INFO, TASKS, EPISODES, ROWS, MP4)),
     (film(40, 64, 10), r"file-000\.mp4 has images of 64 x 64 pixels, not 16 x 16"),
     (film(80, 16, 20), r"mp4 has 20 images per second, the dataset 10: encode the video again"),
@@ -482,6 +493,13 @@ def test_what_is_wrong_with_a_dataset_is_said_before_anything_is_imported(
         demonstrations(changed(home, tmp_path / "dataset", change), ARM_SPEC)
     assert str(tmp_path) in str(caught.value) and len(str(caught.value)) < 2000
     assert "correct" not in says or "copy" in says or "copy the dataset" not in str(caught.value)
+
+
+def test_images_are_found_whatever_the_clock_of_the_stamps(home: Path) -> None:
+    dataset = LeRobotDataset(home / "dataset", None)
+    far = replace(dataset.parts[1], time=1e308)
+    near, same = (dataset.frames(part, "front", (16, 16), 1) for part in (dataset.parts[1], far))
+    np.testing.assert_array_equal(near, same)
 
 
 def test_images_that_drift_away_from_their_steps_are_refused(tmp_path: Path) -> None:

@@ -304,3 +304,16 @@ def test_wheels_that_are_missing_or_of_another_version_end_in_a_sentence(monkeyp
 def test_states_of_another_scene_end_in_a_sentence() -> None:
     with pytest.raises(UserError, match="they are of another scene"):
         Starts(opened("goal 0")[0], tasks_of("long")[9])
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04" + bytes(100)], ids=["empty", "damaged"])
+def test_states_that_cannot_be_read_end_in_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes
+) -> None:
+    task = tasks_of("goal")[0]
+    file = tmp_path / "libero/init_files" / f"{task.states}.npz"
+    file.parent.mkdir(parents=True)
+    file.write_bytes(content)
+    monkeypatch.setattr(package, "folders", lambda: {"@libero": tmp_path})
+    with pytest.raises(UserError, match="the wheel lacks the initial states"):
+        package.initial_states(task)

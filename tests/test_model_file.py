@@ -43,6 +43,8 @@ def write_mesh(path: Path) -> None:
             urdf("model://parts/link.stl"),
             r"mesh at model://parts/link\.stl: meshes are at package://, file://",
         ),
+        (urdf("package://[parts/link.stl"), r"mesh at package://\[parts/link\.stl, which is no address: Invalid IPv6"),
+        (urdf("file:///dev/zero"), r"/dev/zero is a folder, a pipe or a device, not a file"),
         (urdf("file:///nowhere/link.stl"), r"does not compile: .*'/nowhere/link\.stl'"),
     ],
 )

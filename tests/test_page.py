@@ -7,6 +7,7 @@ import io
 import json
 import logging
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from html import unescape
@@ -348,3 +349,13 @@ def test_the_page_of_a_sweep_leads_to_every_cell(tmp_path: Path) -> None:
     trainings = [dict(enumerate(won)) for won in ((True, True, True, True), (True, True, True, False))]
     low, high = (100 * bound for bound in pooled_interval(trainings))
     assert f"bc 87.5 ({low:.1f}-{high:.1f})" in told and markup.count("<svg") == 8
+
+
+def test_a_page_holds_no_file_that_is_no_picture(whole: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(whole, tmp_path / "run"))
+    (tmp_path / "key").write_text("secret")
+    picture = next((folder / "recordings").glob("failure*.webp"))
+    picture.unlink()
+    picture.symlink_to(tmp_path / "key")
+    with pytest.raises(ValueError, match=r"webp is no picture: remove it"):
+        compared([folder], tmp_path / "new")

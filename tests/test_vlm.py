@@ -349,6 +349,10 @@ def test_a_normaliser_without_the_action_and_a_camera_without_counterpart_are_re
         make_smolvla(tokenizer, trunk=str(folder), statistics="pretrained")
     make_smolvla(tokenizer, trunk=str(folder))  # by the demonstrations
     config = json.loads((folder / "config.json").read_text())
+    for key, other in (("input_features", ["front"]), ("input_features", {"a": 1}), ("normalization_mapping", [1])):
+        (folder / "config.json").write_text(json.dumps({**config, key: other}))
+        with pytest.raises(UserError, match=rf"{key} of .*config\.json is damaged or of another kind"):
+            make_smolvla(tokenizer, trunk=str(folder), statistics="pretrained")
     names = {"observation.images.wrist": "observation.images.third"}
     config["input_features"] = {names.get(name, name): value for name, value in config["input_features"].items()}
     (folder / "config.json").write_text(json.dumps(config))

@@ -38,6 +38,7 @@ PICKLE = "--experimental-rerun"  # option of Hydra
 OPTIONS = (PICKLE, "--cfg", "--config-dir", "--config-name", "--config-path", "--info", "--package")  # with values
 # Errors of a command line, a file or a machine.
 MENDABLE = (UserError, OSError, HydraException, OmegaConfBaseException, YAMLError, RecursionError)
+RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")  # variables that Lightning reads on its import
 TRACEBACKS = "VLA_TRACEBACKS"  # environment variable that passes the user's HYDRA_FULL_ERROR to child processes
 
 
@@ -227,6 +228,13 @@ def _require_plain(arguments: list[str]) -> None:
         raise UserError(f"{PICKLE} runs whatever a file says: compose the run again from its command line")
 
 
+def _require_ranks() -> None:
+    """Refuse numbers of processes in the environment that are none."""
+    for name, value in ((name, os.environ.get(name, "0")) for name in RANKS):
+        if not value.isdecimal():
+            raise UserError(f"the environment variable {name} is {value[:50]!r}, not the number of a process: unset it")
+
+
 def main() -> None:
     """Run the command line; errors that the user can fix end in one sentence unless HYDRA_FULL_ERROR=1."""
     ease_garbage_collection()
@@ -237,6 +245,7 @@ def main() -> None:
     sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])
     try:
         _require_plain(sys.argv[1:])
+        _require_ranks()
         offer_options()
         offer_axes()
         _compose()

@@ -182,7 +182,15 @@ class EpisodeStore:
         return sum(after) - sum(before)
 
     def read(self, entry: Entry) -> dict[str, Array]:
-        """Read one episode as field → (steps, …) rows; a DamageError if a checksum differs."""
+        """Read one episode as field → (steps, …) rows; a DamageError if a checksum differs.
+
+        A UserError if it is larger than the memory: a few compressed bytes can promise any image.
+        """
+        if (size := entry.steps * sum(column.size for column in self._columns.values())) > (most := memory()):
+            raise UserError(
+                f"seed {entry.seed} in {self.folder} unpacks to {size / 1e9:.0f} GB, and this machine has "
+                f"{most / 1e9:.0f} GB of memory: leave it out, or read it on a larger machine"
+            )
         sources = {field: self.rows(field) for field in self.fields}
         rows = {field: np.array(source[entry.span]) for field, source in sources.items()}
         for field, values in rows.items():

@@ -16,6 +16,7 @@ import numpy as np
 from vla.data.header import Codec
 from vla.data.image_codec import decode, encode, in_threads
 from vla.io.errors import UserError
+from vla.io.files import require_file
 from vla.spec import Array
 
 END = np.dtype([("end", "<u8"), ("crc", "<u4")])
@@ -85,8 +86,9 @@ class ScatteredRows:
             places = [(row * self._size, self._size) for row in rows.tolist()]
         else:
             starts = np.where(rows > 0, self._ends["end"][rows - 1], 0)
-            sizes = self._ends["end"][rows] - starts  # unsigned: negative ones are large
-            if len(wrong := np.flatnonzero((sizes > self._size + MAX_OVERHEAD) | (starts > np.iinfo(np.int64).max))):
+            ends = self._ends["end"][rows]
+            sizes = ends - starts  # unsigned: negative ones are large
+            if len(wrong := np.flatnonzero((sizes > self._size + MAX_OVERHEAD) | (ends > np.iinfo(np.int64).max))):
                 raise self._damaged(int(rows[wrong[0]]))
             places = list(zip(starts.tolist(), sizes.tolist(), strict=True))
         for place in places:
@@ -123,7 +125,10 @@ class Field:
         return [end, rows * END.itemsize]
 
     def whole(self, rows: int) -> int:
-        """Return how many of the first `rows` rows are complete: fewer if a file was truncated."""
+        """Return how many of the first `rows` rows are complete: fewer if a file was truncated (UserError: one is no
+        file)."""
+        for path in self.files:
+            require_file(path)
         sizes = [path.stat().st_size if path.exists() else 0 for path in self.files]
         rows = min(rows, sizes[-1] // (self.size if self.codec == "raw" else END.itemsize))
         if self.codec == "raw" or not rows:

@@ -105,7 +105,7 @@ class _Bag:
                     self._used.add(topic)
                 except UserError as error:
                     self._dropped.setdefault(topic, str(error))
-                except AttributeError:
+                except (AttributeError, TypeError, ValueError):
                     self._dropped.setdefault(topic, f"they are of type {messages.shorten(self.kinds[topic])}")
         if read < expected:
             raise UserError(f"{folder} is incomplete: {read} of {expected} messages are there, was its end cut off?")

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from vla.deploy.bag import message_types, rosbags
+from vla.deploy.messages import shorten
 from vla.deploy.ros import NETWORKS, command_node, spin
 from vla.io.errors import UserError
 
@@ -60,6 +61,9 @@ class BagRecorder:
             if topic in self._known or package not in MESSAGE_PACKAGES:
                 continue
             self._known.add(topic)
+            if kind not in message_types().fielddefs:  # of another distribution of ROS, or of anybody's making
+                self._node.get_logger().warning(f"{shorten(topic)} is not recorded: its type is {shorten(kind)}")
+                continue
             offered = [info.qos_profile.durability for info in self._node.get_publishers_info_by_topic(topic)]
             qos = latched if {*offered} == {latched.durability} else best_effort
             write = partial(self._write, self._writer.add_connection(topic, kind, typestore=message_types()))

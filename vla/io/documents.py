@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from collections.abc import Iterator
 from functools import cache
 from math import isfinite
@@ -22,6 +23,7 @@ MAX_BYTES = 64 << 20  # [bytes] of a file
 MAX_YAML_BYTES = 1 << 20  # [bytes] of a YAML file, which is slow to parse
 MAX_RESOLVED_BYTES = 4 << 20  # [bytes] of a configuration, which takes thirty times as much before it is counted
 MAX_VALUES = 100_000  # values in a configuration
+LONG_NUMBER = re.compile(r"[-+.:\d_]{100,}")  # in base 60, 1:1:1:…, a megabyte takes minutes
 MAX_DEPTH = 64  # nesting levels in YAML; pydantic's JSON parser stops at 200 by itself
 
 # `__pydantic_config__` of the dataclasses and typed dictionaries that describe a file; LENIENT: which may hold further
@@ -76,16 +78,17 @@ def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:  # a UserError also for impossible dates
         raise UserError(f"{name} is no plain YAML: {' '.join(str(error).split())[:200]}") from error
     if not shallow:
-        raise UserError(f"{name} is nested deeper than {MAX_DEPTH} levels, or has aliases")
+        raise UserError(f"{name} is nested deeper than {MAX_DEPTH} levels, or has aliases or numbers of 100 digits")
     return parse_json(plain, kind, name)
 
 
 def _is_shallow(text: str | bytes) -> bool:
-    """Return whether YAML text has at most `MAX_DEPTH` levels and no aliases."""
+    """Return whether YAML text has at most `MAX_DEPTH` levels, and neither aliases nor long numbers."""
     depth = 0
     for event in yaml.parse(text, Loader=yaml.CSafeLoader):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > MAX_DEPTH or isinstance(event, yaml.AliasEvent):
+        long = isinstance(event, yaml.ScalarEvent) and LONG_NUMBER.fullmatch(event.value)
+        if depth > MAX_DEPTH or long or isinstance(event, yaml.AliasEvent):
             return False
     return True
 
@@ -121,7 +124,10 @@ def resolved(value: Any, name: str) -> Any:
 
 
 def read_resolved(path: Path) -> Any:
-    """Read the JSON file at `path` as a configuration, see `resolved`; a UserError also if a key stands twice."""
+    """Read the JSON file at `path` as a configuration, see `resolved`.
+
+    There is a UserError also if a key stands twice, or a text has half a character, which could not be written again.
+    """
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len(found := dict(pairs)) < len(pairs):
@@ -131,6 +137,7 @@ def read_resolved(path: Path) -> Any:
     try:
         text = read_bounded(path, MAX_RESOLVED_BYTES)
         value = json.loads(text, object_pairs_hook=unique, parse_constant=int)  # which NaN is not
+        json.dumps(value, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is damaged or of another kind: {str(error)[:200]}") from error
     return resolved(value, str(path))

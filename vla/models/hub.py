@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from http.client import HTTPException
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import urlopen
@@ -50,6 +51,6 @@ def _unreachable() -> str | None:
     try:
         with suppress(HTTPError):  # also a response
             urlopen(constants.ENDPOINT, timeout=TIMEOUT).close()
-    except OSError as error:
+    except (OSError, ValueError, HTTPException) as error:  # also of an HF_ENDPOINT that is no address
         return str(error)
     return None

@@ -9,6 +9,7 @@ from typing import Any
 
 from vla.io.documents import lines_of, read_json
 from vla.io.errors import UserError
+from vla.io.files import require_file
 from vla.models.hub import HUB, fetch
 
 CONFIG, WEIGHTS = "config.json", "model*.safetensors"
@@ -43,9 +44,10 @@ def trunk_folder(name: str) -> Path:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Open a safetensors file, whose header is checked; a UserError if it is damaged."""
+    """Open a safetensors file, whose header is checked; a UserError if it is damaged, or no file."""
     from safetensors import safe_open
 
+    require_file(path)
     try:
         with safe_open(path, "pt") as file:
             yield file

@@ -24,6 +24,7 @@ from vla.reports.tables import Table, in_brackets
 
 WORDS = 12  # maximum number of bars for words and for instructions
 FRAMES, COLUMNS = 4, 4  # episodes whose first images are shown, panels per row
+DRAWN = 200  # maximum number of panels of draws
 
 
 def store_table(findings: StoreReport) -> Table:
@@ -104,7 +105,8 @@ def _panels(findings: StoreReport) -> Panels:
         for name, value in flat(entry.draws).items():
             drawn.setdefault(name, []).append(value)
     varied = {name: values for name, values in drawn.items() if len({str(value) for value in values}) > 1}
-    return panels | {name: partial(_plot_values, values=values) for name, values in varied.items()}
+    shown_draws = [*varied.items()][:DRAWN]
+    return panels | {name: partial(_plot_values, values=values) for name, values in shown_draws}
 
 
 def _plot_values(axes: Axes, values: Sequence[Any], log: bool = False) -> None:

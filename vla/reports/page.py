@@ -13,6 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from vla.io.documents import read_bounded
+from vla.io.errors import UserError
 from vla.io.files import write_text
 from vla.reports.tables import Table, in_words
 from vla.rollouts.moving_picture import LARGEST
@@ -70,5 +71,8 @@ def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bo
 
 
 def _embedded(picture: Path) -> str:
-    """Return a picture as a data URL."""
-    return f"data:image/{picture.suffix[1:]};base64,{b64encode(read_bounded(picture, LARGEST)).decode()}"
+    """Return a picture as a data URL; a UserError if it is none: a link could put any file into a page."""
+    content = read_bounded(picture, LARGEST)
+    if not content.startswith((b"RIFF", b"\x89PNG")):
+        raise UserError(f"{picture} is no picture: remove it")
+    return f"data:image/{picture.suffix[1:]};base64,{b64encode(content).decode()}"

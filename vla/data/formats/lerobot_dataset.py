@@ -218,20 +218,20 @@ class LeRobotDataset:
         were cut off, or the stamps are of another clock: then the video does not reach as far as they do.
         """
         begin, end = part.place[f"videos/{key}/from_timestamp"], part.place[f"videos/{key}/to_timestamp"]
-        cut, steps = max(round(part.time * self.info.fps), 0), len(part.rows)
+        cut, steps = max(float(np.rint(part.time * self.info.fps)), 0.0), len(part.rows)
         return begin + cut / self.info.fps if begin + (cut + steps - 0.5) / self.info.fps <= end else begin
 
     def _content(self, picture: Mapping[str, Any]) -> bytes:
         """Return an image file that a cell of a table holds, or names by its path in the folder of the dataset."""
         if picture.get("bytes"):
             return picture["bytes"]
-        if not (path := picture.get("path")):
+        if not (path := str(picture.get("path") or "").replace("\0", "")):  # which no path has
             raise UserError(f"there is no image: {MEND}")
         folder = os.path.realpath(self.folder)
-        file = Path(os.path.realpath(os.path.join(folder, str(path))))  # untrusted, it could lead anywhere
+        file = Path(os.path.realpath(os.path.join(folder, path)))  # untrusted, it could lead anywhere
         if not file.is_relative_to(folder) or not os.path.isfile(file):
             raise UserError(
-                f"the table has no image but the path {str(path)[:200]!r}, which is no file in the folder of the "
+                f"the table has no image but the path {path[:200]!r}, which is no file in the folder of the "
                 "dataset: copy the images there, or embed them in the tables"
             )
         return read_bounded(file)

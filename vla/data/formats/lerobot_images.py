@@ -109,7 +109,7 @@ def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoS
     """Open a video and its first stream; errors within, of reading it, become a UserError."""
     require_file(path)
     try:
-        with av.open(path) as file:
+        with av.open(path, format="mp4") as file:  # others are lists of further files, wherever they are
             yield file, file.streams.video[0]
     except (av.error.FFmpegError, OSError, IndexError) as error:
         raise UserError(f"{path} cannot be read as a video: {error}") from error

@@ -45,7 +45,8 @@ def _are_numbers(column: Column) -> bool:
 
 
 def _are_files(column: Column) -> bool:
-    return pa.types.is_struct(column.type) and column.type.get_field_index("bytes") >= 0
+    kinds = {field.name: field.type for field in column.type} if pa.types.is_struct(column.type) else {}
+    return "bytes" in kinds and (pa.types.is_binary(kinds["bytes"]) or pa.types.is_large_binary(kinds["bytes"]))
 
 
 def _within(column: Column, high: float) -> bool:
@@ -104,8 +105,9 @@ def _unpacked_size(path: Path, columns: Collection[str], filtered: bool) -> int:
 def require(path: Path, columns: Mapping[str, Kind]) -> None:
     """Raise a UserError unless a file has columns of the expected types; their values are not read."""
     empty = schema_of(path).empty_table()
-    if missing := [name for name in columns if name not in empty.column_names]:
-        raise UserError(f"{path} lacks the columns {', '.join(missing)}: {MEND}")
+    if wrong := [name for name in columns if empty.column_names.count(name) != 1]:
+        told = "has twice" if wrong[0] in empty.column_names else "lacks"
+        raise UserError(f"{path} {told} the columns {', '.join(wrong)}: {MEND}")
     _require_kinds(path, empty, columns)
 
 

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from vla.io.documents import lines_of, mappings, read_json
 from vla.io.errors import UserError
+from vla.io.files import require_file
 from vla.models.hub import fetch
 from vla.models.packaged import PackagedFile
 from vla.models.text.ngrams import TextEncoder
@@ -26,6 +27,7 @@ from vla.models.text.ngrams import TextEncoder
 log = logging.getLogger(__name__)
 
 WEIGHTS = "model*.safetensors"
+ADAPTER = "adapter_config.json"  # of weights that transformers would add, whose SHA-256 is not known
 FILES = ("config.json", "tokenizer.json", "tokenizer_config.json", WEIGHTS, "model.safetensors.index.json")
 KEPT = 1 << 13  # sentence vectors, 4 kB of 1024 components each
 
@@ -64,6 +66,7 @@ class SentenceEncoder:
             raise UserError(f"{folder} is no text encoder as save_pretrained writes them: {reason}") from error
         digest = hashlib.sha256()
         for path in sorted(folder.glob(WEIGHTS)):
+            require_file(path)
             digest.update(path.read_bytes())
         self.sha256 = digest.hexdigest()  # of the weights
 
@@ -168,8 +171,10 @@ def _network(folder: Path) -> tuple[Any, str | None]:
     import transformers
 
     values = read_json(folder / "config.json", dict[str, Any])
+    if (folder / ADAPTER).exists():
+        raise UserError(f"it has an adapter, {ADAPTER}: merge that into its weights")
     for part in mappings(values):  # without the keys by which transformers downloads and runs code
-        for key in [key for key in part if key == "auto_map" or "implementation" in key]:
+        for key in [key for key in part if key in ("auto_map", "quantization_config") or "implementation" in key]:
             del part[key]
     config = transformers.AutoConfig.for_model(values.pop("model_type", None), **values)
     config = getattr(config, "text_config", config)

@@ -121,6 +121,8 @@ class Fast(ActionTokenizer):
             return
         try:
             self._least, self._most = map(int, state["coefficients"])
+            if not -(2**31) <= self._least <= self._most < 2**31:
+                raise ValueError("its coefficients are no range of numbers of 32 bits")
             self._set_bpe(Tokenizer.from_str(state["bpe"]))
         except Exception as error:  # tokenizers raises a plain Exception for invalid text
             raise UserError(f"the tokenizer of the policy cannot be read: {str(error)[:200]}") from error
@@ -141,6 +143,8 @@ class Fast(ActionTokenizer):
         self._set_bpe(bpe)
 
     def _set_bpe(self, bpe: Tokenizer) -> None:
+        bpe.no_padding()  # which a file could ask for, to any length
+        bpe.no_truncation()
         self._bpe = bpe
         vocabulary = sorted(bpe.get_vocab().items(), key=lambda item: item[1])
         self._pieces = ["" if number == self.end else piece for piece, number in vocabulary]

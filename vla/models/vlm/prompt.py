@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vla.io.documents import lines_of
+from vla.io.documents import lines_of, read_bounded
 from vla.io.errors import UserError
 from vla.io.types import Steps, Text
 from vla.models.hub import fetch
@@ -119,7 +119,7 @@ def _tokenizer(name: str) -> tuple[Any, str]:
     advice = f"nor is it a folder here: give model.text.name one with its {FILE}"
     path = (Path(name) if Path(name).is_dir() else fetch(name, FILE, advice=advice)) / FILE
     try:
-        content = path.read_bytes()
+        content = read_bounded(path)
         tokenizer = Tokenizer.from_buffer(content)
     except Exception as error:  # tokenizers raises Exception itself
         raise UserError(f"{path} is no tokenizer: {lines_of(error)[0][:200]}") from error

@@ -5,18 +5,20 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from vla.io.documents import read_json
+from vla.io.documents import parse_plain, read_json
 from vla.io.errors import UserError
 from vla.models.trunk import Source
 from vla.models.trunk_folder import CONFIG, WEIGHTS, opened, trunk_folder
 from vla.models.vlm.network import FlowNetwork, renamed
 from vla.models.vlm.normalizer import MODES, Kind
 from vla.parallel.limits import memory
+
+Part = TypeVar("Part")
 
 PREPROCESSOR = "policy_preprocessor.json"
 NORMALIZER = "normalizer_processor"  # its step
@@ -65,7 +67,7 @@ class Trunk:
     @property
     def cameras(self) -> list[str]:
         """The cameras that the policy sees, in their order; empty for a vision-language model alone."""
-        features = self._config.get("input_features") or {}
+        features = self._of("input_features", dict[str, dict[str, Any]])
         return [name.removeprefix(IMAGES) for name, each in features.items() if each.get("type") == "VISUAL"]
 
     def statistics(self, kind: Kind) -> dict[str, Tensor]:
@@ -74,18 +76,23 @@ class Trunk:
         Raises:
             UserError: it normalises in another way than `kind`.
         """
-        mapping = self._config.get("normalization_mapping") or {}
-        modes = {str(mapping[each]) for each in ("STATE", "ACTION") if each in mapping}
+        mapping = self._of("normalization_mapping", dict[str, str])
+        modes = {mapping[each] for each in ("STATE", "ACTION") if each in mapping}
         if wrong := modes - {MODES[kind]}:
             raise UserError(
                 f"{self} normalises by {', '.join(sorted(wrong))}, and model.normalization is {kind}: choose the same, "
                 "or model.statistics=demonstrations"
             )
         path = self.folder / PREPROCESSOR
-        steps = read_json(path, dict[str, Any]).get("steps", []) if path.is_file() else []
+        read = read_json(path, dict[str, Any]).get("steps", []) if path.is_file() else []
+        steps = parse_plain(read, list[dict[str, Any]], f"steps of {path}")
         files = [step.get("state_file") for step in steps if step.get("registry_name") == NORMALIZER]
-        paths = [self.folder / Path(name).name for name in files if name]
+        paths = [self.folder / Path(str(name)).name for name in files if name]
         return {name: tensor for path in paths if path.is_file() for name, tensor in _tensors([path])}
+
+    def _of(self, key: str, kind: type[Part]) -> Part:
+        """Return a mapping of the config, which may lack it."""
+        return parse_plain(self._config.get(key) or {}, kind, f"{key} of {self.folder / CONFIG}")
 
     def build(self, network: Callable[[], FlowNetwork]) -> FlowNetwork:
         """Build a network with these weights; what a vision-language model has no weights for is random.

@@ -22,6 +22,7 @@ import mujoco
 from annotated_types import MinLen
 
 from vla.io.errors import UserError, suggestion
+from vla.io.files import require_file
 from vla.io.types import Inherited, Names, Point, Positive, Text
 
 log = logging.getLogger(__name__)
@@ -121,7 +122,9 @@ def read(file: Path, key: str) -> mujoco.MjSpec:
     for mesh in spec.meshes:
         if mesh.file:
             name = Path(mesh.file).name if spec.strippath else mesh.file
-            mesh.file = str(_located(named, name, path.parent / (spec.compiler.meshdir or ""), path))
+            located = _located(named, name, path.parent / (spec.compiler.meshdir or ""), path)
+            require_file(located)
+            mesh.file = str(located)
     spec.compiler.meshdir = ""
     _drop_textures(spec, named, path)
     plain = mujoco.MjSpec()
@@ -138,7 +141,10 @@ def _located(named: str, mesh: str, folder: Path, model: Path) -> Path:
     of another kind, or of a package that is not found)."""
     if "://" not in mesh:
         return folder / mesh
-    kind, package, rest, *_ = urlsplit(mesh)
+    try:
+        kind, package, rest, *_ = urlsplit(mesh)
+    except ValueError as error:  # such as a bracket
+        raise UserError(f"{named} has a mesh at {mesh}, which is no address: {error}") from error
     inside = unquote(rest).lstrip("/")
     if kind == "file":
         return Path("/", inside)
