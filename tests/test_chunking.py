@@ -284,12 +284,12 @@ def test_what_cannot_continue_plans_is_refused() -> None:
         as_policy(make_act(), chunking=METHODS["guided"]())
     with pytest.raises(ValueError, match=r"TrainedPrefix needs a model that was trained with prefixes: model"):
         as_policy(make_flow(prefix=0), chunking=TrainedPrefix())
-    with pytest.raises(ValueError, match=r"model\.prefix=7 leaves less than 2 of the model\.chunk=8 actions, which"):
+    with pytest.raises(ValueError, match=r"model\.chunk=8 has no room for model\.prefix=7 and the model\.execute=2"):
         make_flow(prefix=7)
     require_fit(TrainedPrefix, {"chunk": 8, "execute": 2, "prefix": 4}, delay=4)
-    with pytest.raises(ValueError, match=r"a plan that is late by 5 actions ends before the next one, which follows 5"):
+    with pytest.raises(ValueError, match=r"begin 5 actions apart and arrive 5 late, when model\.chunk=8 has run out"):
         require_fit(Guided, {"chunk": 8, "execute": 2}, delay=5)
-    with pytest.raises(ValueError, match=r"late by 3 actions, more than the model\.prefix=2 that it was trained for"):
+    with pytest.raises(ValueError, match=r"3 actions late, but the model was trained for model\.prefix=2"):
         require_fit(TrainedPrefix, {"chunk": 8, "execute": 2, "prefix": 2}, delay=3)
 
 
@@ -309,9 +309,7 @@ def test_before_any_work_chunking_must_go_with_the_model(overrides: list[str], s
 def test_before_any_work_plans_must_be_long_enough_for_the_network(tmp_path: Path) -> None:
     config = [f"output={tmp_path}", "model=flow", "evaluate=latency", "+policy/chunking=guided"]
     require_possible(Experiment.of(composed(*config)))
-    with pytest.raises(
-        ValueError, match=r"late by 3 actions ends before the next one, which follows 3 actions after it"
-    ):
+    with pytest.raises(ValueError, match=r"begin 3 actions apart and arrive 3 late, when model\.chunk=5 has run out"):
         require_possible(Experiment.of(composed(*config, "model.chunk=5")))
 
 

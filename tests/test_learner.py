@@ -161,7 +161,7 @@ def test_nothing_is_counted_or_averaged_in_a_frozen_part(frozen: list[str]) -> N
     ("options", "says"),
     [
         ({"frozen": ["contxt"]}, r"learner\.frozen names contxt, .* it has text, truth_head, features, mlp, head"),
-        ({"rates": {"features.image": 0.1}}, r"names features\.image, which no parameter .*: features has images, "),
+        ({"rates": {"features.image": 0.1}}, r"names features\.image, which is no part .*: features has images, "),
         ({"frozen": ["text", "truth_head", "features", "mlp", "head"]}, "leaves nothing to train"),
     ],
 )

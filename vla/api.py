@@ -22,8 +22,7 @@ def load_policy(
 ) -> Policy:
     """Load a trained policy.
 
-    Its folder contains no code, but names classes: of other packages only those are built that are trusted, here or
-    by `VLA_TRUST`.
+    Its folder contains no code, but names classes: those of other packages must be trusted, here or by `VLA_TRUST`.
 
     Args:
         checkpoint: the folder of a policy, or of a run that has one, or hub:owner/name@revision.

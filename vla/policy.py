@@ -47,10 +47,10 @@ class Lane:
 class Policy:
     """Agents around a model: each caches encoded frames of its history, and executes the first actions of each chunk.
 
-    Every lane, named by a number, is an agent in an episode of its own. What it does is the same bit for bit whatever
-    the others do, and however many there are: because a sum is rounded by the shape of its product and the place of its
-    row, the model always computes `lanes` rows, of which unused ones are padding, and the seed of an episode is its
-    place, modulo `lanes`. Lanes of one place, or with instructions of different lengths, take several passes.
+    Every lane, named by a number, is an agent in an episode of its own, and acts the same, bit for bit, whatever the
+    others do and however many they are. The rounding of a product depends on its shape and on the row: so the model
+    always computes `lanes` rows, with padding in unused ones, and an episode has the row of its seed modulo `lanes`.
+    Lanes of the same row, or with instructions of different lengths, take several passes.
 
     Args:
         device: "auto" is a GPU if there is one.
@@ -103,7 +103,8 @@ class Policy:
     def reset(self, instruction: str, seed: int, lane: int = 0) -> None:
         """Start an episode in a lane: clear its history, and seed its noise.
 
-        An episode that begins without is that of the lane's number, with another instruction that of the same seed.
+        Observations of a lane that was never reset start an episode with the lane's number as its seed; those with
+        another instruction than before start one with the same seed.
 
         Raises:
             UserError: the instruction has more than `LONGEST_INSTRUCTION` characters.
@@ -133,8 +134,7 @@ class Policy:
     def act(self, observations: Seen, lanes: Sequence[int] | None = None) -> Array:
         """Return the actions to execute, (n, D) float32, clipped to the spec, of n lanes, given what each of them sees.
 
-        Without `lanes`, return the action (D,) for the one observation of lane 0, which may also be that of
-        `vla.api.load_environment`.
+        Without `lanes`, return the action (D,) for one observation of lane 0, also one of `vla.api.load_environment`.
 
         Raises:
             UserError: an observation does not match the spec; no lane has acted then.
@@ -143,9 +143,10 @@ class Policy:
             return self.act([self._one(observations)], [0])[0]
         seen = self._followed(observations, lanes)
         self._observe({lane: each for lane, each in seen.items() if self.looking(lane)})
-        wanting = {lane: self._lanes[lane] for lane in lanes if self._wants_plan(lane)}
-        rests = {lane: [action for action, _ in each.schedule.remaining(each.step)] for lane, each in wanting.items()}
-        running = {lane: Running(np.reshape(rest, (-1, len(self._low))), 0) for lane, rest in rests.items()}
+        running = dict[int, Running]()  # the end of the old plan of every lane that wants a new one
+        for lane in filter(self._wants_plan, lanes):
+            rest = [action for action, _ in self._lanes[lane].schedule.remaining(self._lanes[lane].step)]
+            running[lane] = Running(np.reshape(rest, (-1, len(self._low))), 0)
         for lane, chunk in self._predict(running).items():
             self._lanes[lane].schedule.add(chunk, self._lanes[lane].step)
         chosen = []
@@ -193,9 +194,9 @@ class Policy:
                 self._lanes[lane].frames.append({name: values[row : row + 1] for name, values in kept.items()})
 
     def _predict(self, lanes: Mapping[int, Running]) -> dict[int, list[tuple[Array, dict[str, Any]]]]:
-        """Return lane → its chunk of clipped actions, (D,) each, with what is known about them.
+        """Return lane → its chunk of clipped actions, (D,) each, with what is known about each.
 
-        Those of its running plan that are over by then come first.
+        With `chunking` a chunk begins with those actions of the running plan that are over when it arrives.
         """
         chunks = {}
         for rows, windows in self._passes({lane: self._inputs(lane, plan) for lane, plan in lanes.items()}):
@@ -203,31 +204,31 @@ class Policy:
                 predicted, probabilities = self._predict_chunk(windows)
             actions = np.clip(predicted.float().cpu().numpy(), self._low, self._high)
             for row, lane in rows.items() if self.chunking else ():
-                certain = lanes[lane].actions[: lanes[lane].delay][: len(actions[row])]
-                actions[row, : len(certain)] = certain
+                over = lanes[lane].actions[: lanes[lane].delay][: len(actions[row])]
+                actions[row, : len(over)] = over
             infos: list[list[dict[str, Any]]] = [[{} for _ in chunk] for chunk in actions]
             if probabilities is not None:
-                infos = [[{"probabilities": each} for each in of] for of in probabilities.float().cpu().numpy()]
+                infos = [[{"probabilities": each} for each in chunk] for chunk in probabilities.float().cpu().numpy()]
             chunks |= {lane: list(zip(actions[row], infos[row], strict=True)) for row, lane in rows.items()}
         return chunks
 
     def _passes(self, inputs: Mapping[int, Batch]) -> Iterator[tuple[dict[int, int], Batch]]:
         """Divide the inputs of lanes, batches of one, into passes with instructions of one length.
 
-        Yields row → lane, and the batch of all rows, in which any of the inputs stands for those of no lane.
+        Yields row → lane, and the batch of all rows; a row without a lane repeats the input of a lane.
         """
-        passes: dict[int, list[dict[int, int]]] = {}  # length of the instruction → passes
+        passes: dict[int, list[dict[int, int]]] = {}  # length of the instruction → passes, each row → lane
         for lane in inputs:
             state = self._lanes[lane]
-            row, alike = state.seed % self.lanes, passes.setdefault(state.text.shape[1], [])
-            free = next((each for each in alike if row not in each), None)
-            if free is None:
-                alike.append(free := {})
-            free[row] = lane
+            row, of_length = state.seed % self.lanes, passes.setdefault(state.text.shape[1], [])
+            rows = next((rows for rows in of_length if row not in rows), None)
+            if rows is None:
+                of_length.append(rows := {})
+            rows[row] = lane
         for rows in chain.from_iterable(passes.values()):
-            some = next(iter(rows.values()))
-            every = [inputs[rows.get(row, some)] for row in range(self.lanes)]
-            yield rows, every[0] if self.lanes == 1 else _joined(every)
+            padding = next(iter(rows.values()))
+            batches = [inputs[rows.get(row, padding)] for row in range(self.lanes)]
+            yield rows, batches[0] if self.lanes == 1 else _joined(batches)
 
     @contextmanager
     def _computing(self) -> Iterator[None]:

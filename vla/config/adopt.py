@@ -1,8 +1,7 @@
 """Merge of a composed config with the policy or run that it names.
 
 `checkpoint=RUN` takes task, tokenizer and model from a policy, `pretrained=RUN` tokenizer, model and data for a new
-training (with job=improve also task, expert and learner), `resume=RUN` the whole config of a run. Overrides of these
-nodes on the command line apply on top.
+training (with job=improve also task, expert and learner), `resume=RUN` all of a run; overrides apply on top.
 """
 
 from __future__ import annotations

@@ -122,19 +122,19 @@ def mismatch(key: str, value: Any, annotation: Any) -> str:
     try:
         _adapter(annotation).validate_json(json.dumps(value), strict=True)
     except ValidationError as error:
-        found = error.errors(include_url=False, include_context=False)
+        errors = error.errors(include_url=False, include_context=False)
     else:
         return ""
     # Members of a union fail in different depths: the deepest tells most.
-    place, part = max((_within(value, each["loc"]) for each in found), key=lambda within: len(within[0]))
-    reasons = dict.fromkeys(each["msg"] for each in found if _within(value, each["loc"])[0] == place)
+    path, part = max((_within(value, each["loc"]) for each in errors), key=lambda within: len(within[0]))
+    reasons = dict.fromkeys(each["msg"] for each in errors if _within(value, each["loc"])[0] == path)
     words = [re.sub(r"^\w+ should (be )?| after validation.*", "", each).replace("None", "null") for each in reasons]
-    choices = [str(choice) for choice in get_args(annotation)] if get_origin(annotation) is Literal else []
     verb = "must" if words[0].startswith("have ") else "must be"
-    asked, option = f"{key}{place} {verb} {' or '.join(words)}, got {short(part)}", isinstance(part, str)
-    if option and any(each["type"] == "node" for each in found):
-        return f"{asked}: an option is chosen with a slash, {f'{key}{place}'.replace('.', '/')}={part}"
-    return f"{asked}{suggestion(str(part), choices)}"
+    sentence = f"{key}{path} {verb} {' or '.join(words)}, got {short(part)}"
+    if isinstance(part, str) and any(each["type"] == "node" for each in errors):
+        return f"{sentence}: an option is chosen with a slash, {f'{key}{path}'.replace('.', '/')}={part}"
+    choices = [str(choice) for choice in get_args(annotation)] if get_origin(annotation) is Literal else []
+    return f"{sentence}{suggestion(str(part), choices)}"
 
 
 def _within(value: Any, location: Sequence[int | str]) -> tuple[str, Any]:

@@ -33,9 +33,12 @@ class Job:
 
     def needs(self, config: Mapping[str, Any]) -> dict[str, Group]:
         """Return name → group of everything that it builds from with a config."""
-        agent, checkpoint = (config.get(name) is not None for name in ("agent", "checkpoint"))
-        further = () if agent else self.without_agent if checkpoint else (*self.without_agent, *self.without_checkpoint)
-        groups = (GROUPS[name] if isinstance(name, str) else name for name in (*self.groups, *further))
+        names = [*self.groups]
+        if config.get("agent") is None:
+            names += self.without_agent
+            if config.get("checkpoint") is None:
+                names += self.without_checkpoint
+        groups = (GROUPS[name] if isinstance(name, str) else name for name in names)
         return {group.name: group for group in groups}
 
 

@@ -48,20 +48,22 @@ class Experiment:
     @classmethod
     def of(cls, cfg: DictConfig, default: DictConfig | None = None) -> Experiment:
         """Create the experiment of a composed config; `default` is the config without overrides."""
-        here = {group.name: None for group in GROUPS.values() if group.optional} | plain(cfg)
+        nodes = {group.name: None for group in GROUPS.values() if group.optional} | plain(cfg)
         if default is None:
-            return cls(here)
-        chosen, standard = (OmegaConf.to_container(each, resolve=False) for each in (cfg, default))
-        there = plain(default)
-        changes = [
-            {"key": key, "here": at(here, key, value), "default": at(there, key, before)}
-            for key, value, before in differences(chosen, standard)
-            if not at(here, key) == at(there, key) != ABSENT  # else one is an interpolation of the same value
-            and key.rpartition(".")[2] != SECRET
-            and not key.startswith("chosen.")  # names of options, whose values are compared
-            and not (value == ABSENT and _class_differs(key, here, there))  # settings of the default's class
-        ]
-        return cls(here, _without_secrets(changes))
+            return cls(nodes)
+        default_nodes, changes = plain(default), []
+        # Unresolved, so that a value is one difference and not one in each place that refers to it.
+        unresolved, default_unresolved = (OmegaConf.to_container(each, resolve=False) for each in (cfg, default))
+        for key, mine, its in differences(unresolved, default_unresolved):
+            if key.rpartition(".")[2] == SECRET or key.startswith("chosen."):  # the values of options are compared
+                continue
+            if mine == ABSENT and _class_differs(key, nodes, default_nodes):  # a setting of the default's class
+                continue
+            value, standard = at(nodes, key), at(default_nodes, key)
+            if value != standard or value == ABSENT:  # else a reference and a literal have the same value
+                here, there = at(nodes, key, mine), at(default_nodes, key, its)
+                changes.append({"key": key, "here": here, "default": there})
+        return cls(nodes, _without_secrets(changes))
 
     @cached_property
     def config(self) -> Node:
@@ -345,9 +347,9 @@ def _model(nodes: Node, spec: Spec, saved: SavedPolicy | None = None, weights: b
 
 
 def _model_node(nodes: Node, saved: SavedPolicy | None, weights: bool) -> Node:
-    """Return the node of a model that gets `weights`: without pretrained ones, unless a `saved` policy lacks those."""
-    named = saved is not None and bool(saved.training.trunks)
-    return _without_weights(nodes["model"]) if weights and not named else nodes["model"]
+    """Return the node of a model that gets `weights`: without pretrained ones, unless the saved policy needs those."""
+    has_trunks = saved is not None and bool(saved.training.trunks)  # whose weights are not in its folder
+    return _without_weights(nodes["model"]) if weights and not has_trunks else nodes["model"]
 
 
 def _without_weights(model: Node) -> Node:

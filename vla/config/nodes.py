@@ -187,8 +187,7 @@ class Benchmark:
 def conditions(together: Mapping[str, Changes], one_by_one: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return condition → overrides of the task node: those of `together`, then each part of `one_by_one`.
 
-    A part at a level is named `part_level`, such as light_hard, or `part` if all levels are equal. A part that is null
-    at every level is left out.
+    A part at a level is named `part_level`, or `part` if all levels are equal. What is null at every level is left out.
 
     Args:
         together: condition → overrides.

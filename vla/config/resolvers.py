@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 def digest(*keys: str, _root_: DictConfig) -> str:
     """Resolve `${digest:task,expert,collect.seed}`: twelve hexadecimal digits of the values at dotted `keys`.
 
-    The order of mappings matters, because randomisation axes are applied in order. Null equals an absent key, and 10
-    equals 10.0.
+    The order of mappings matters: randomisation axes are applied in it. Null equals an absent key, and 10 equals 10.0.
     """
     values = [OmegaConf.select(_root_, key, throw_on_missing=True) for key in keys]
     plain = [OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value for value in values]
@@ -40,8 +39,7 @@ def chosen(group: str, *, _root_: DictConfig) -> str | None:
 
 
 def recorded(name: str, *, _root_: DictConfig) -> Any:
-    """Resolve `${recorded:NAME}`: an attribute of the `Recording` that the expert reads, or `low` or `high`, the bounds
-    of the task's actions.
+    """Resolve `${recorded:NAME}`: an attribute of the expert's `Recording`, or `low` or `high`, the bounds of actions.
 
     There is a UserError if the expert reads no recording, or there is none.
     """

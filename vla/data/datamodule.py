@@ -1,8 +1,7 @@
 """Data module of training windows: a history of frames and a chunk of the actions that follow.
 
 A batch is one gather per field from the memory-mapped rows of the episode store, made by one thread while the model
-works on earlier batches. Its windows depend on the seed and the step number alone, so a resumed run is trained on
-exactly the batches of an uninterrupted one.
+works on earlier batches. Its windows depend on the seed and the step number alone, also when a run is resumed.
 """
 
 # B batch, T history frames, k action chunk, D action components, S truth scalars

@@ -32,10 +32,9 @@ def derive_store(
     """Write a new store of the episodes in others of the same spec that match `where`, atomically (UserError: the
     folder exists, or another process writes it; specs differ, nothing matches, or an episode is damaged).
 
-    Seeds are in order, config by config. Of the same seed and config one undamaged episode is kept. If all seeds
-    between the first and the last of a single config exist, the new store equals a collected one, and can grow. With
-    `repair` the sources may be damaged, and an episode that is damaged in all of them becomes a failed seed. Returns
-    these seeds.
+    Seeds are in order, config by config. Of the same seed and config one undamaged episode is kept. If there is one
+    config and no seed is missing between the first and the last, the new store equals a collected one, and can grow.
+    With `repair` an episode may be damaged: if it is in all sources, it becomes a failed seed. Returns these seeds.
     """
     if folder.exists():
         raise UserError(f"{folder} exists already and is left alone: choose another inspect.into")
@@ -93,8 +92,8 @@ def _config(chosen: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, 
 
 def _write(new: EpisodeStore, copies: Copies, repair: bool) -> bool:
     """Add a seed to a store from its first undamaged copy; returns whether there was one."""
-    known = [(source, entry) for source, entry in copies if entry.outcome != LOST]
-    for source, entry in sorted(known, key=lambda copy: not copy[1].stored):  # an episode rather than a failure
+    readable = [(source, entry) for source, entry in copies if entry.outcome != LOST]
+    for source, entry in sorted(readable, key=lambda copy: not copy[1].stored):  # an episode rather than a failure
         if not entry.stored:
             new.fail(without_rows(entry))
             return True
@@ -104,5 +103,6 @@ def _write(new: EpisodeStore, copies: Copies, repair: bool) -> bool:
         except DamageError:
             if not repair:
                 raise
-    new.fail(replace(without_rows((known or copies)[0][1]), outcome=DAMAGED))
+    _, entry = (readable or copies)[0]
+    new.fail(replace(without_rows(entry), outcome=DAMAGED))
     return False

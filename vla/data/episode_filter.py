@@ -1,8 +1,7 @@
 """Filter for episodes by seed, task, instruction, outcome, length and draws, written as plain data.
 
 A condition is a text with the wildcards `*` and `?`; a number or a boolean; a range `[low, high]`, of which an end may
-be null; or a list of texts, one of which must match. A name with several values, such as a draw per block, matches if
-all of them do.
+be null; or a list of texts, one of which must match. A name with several values matches if all of them do.
 """
 
 from __future__ import annotations

@@ -102,15 +102,15 @@ class EpisodeStore:
         """Raise a UserError if the episodes have another config, unless they were chosen explicitly."""
         if self.derived:
             return
-        asked, there = canonical(json.loads(dumps(config))), canonical(self.config)
-        different = sorted(key for key in {*asked, *there} if asked.get(key) != there.get(key))
+        wanted, stored = canonical(json.loads(dumps(config))), canonical(self.config)
+        different = sorted(key for key in {*wanted, *stored} if wanted.get(key) != stored.get(key))
         if different:
             raise UserError(f"{self.folder} was collected with another config for {different}: choose another folder")
 
     def lacks(self, key: str, node: Any) -> bool:
         """Return whether no part of a derived store has a node of the config."""
-        asked = canonical(json.loads(dumps(node)))
-        return self.derived and all(canonical(config.get(key)) != asked for config, _ in self.config["parts"])
+        wanted = canonical(json.loads(dumps(node)))
+        return self.derived and all(canonical(config.get(key)) != wanted for config, _ in self.config["parts"])
 
     def require_codec(self, codec: Codec | None) -> None:
         """Raise a UserError if the images have other losses than those of `codec`; None: whatever they have."""
@@ -160,8 +160,8 @@ class EpisodeStore:
     def rows(self, field: str, scattered: bool = False) -> Rows:
         """Return all committed rows of `field`, (N, …), which are read when they are indexed.
 
-        They are a memory-mapped array, or `ScatteredRows`, which raise a DamageError for a damaged image: those of
-        compressed images, and of a large store all that are `scattered`, to be taken in random order.
+        Compressed images are `ScatteredRows`, which raise a DamageError for a damaged image; so are the rows of a large
+        store that are `scattered`, which means read in random order. All other rows are a memory-mapped array.
         """
         if field not in self.fields:
             raise UserError(f"{self.folder} has no field {field!r}: it has {sorted(self.fields)}")

@@ -29,8 +29,7 @@ class ScatteredRows:
     """Array-like rows that are read one by one, in random order, and decoded by one thread per core.
 
     Of a memory-mapped array the kernel reads ahead, on some machines by megabytes; of a file that is larger than the
-    free memory, most of that is evicted before it is used. Here the kernel knows all rows of a batch beforehand, and
-    reads nothing else.
+    free memory, most of that is evicted before it is used. Here the kernel reads the rows of a batch and nothing else.
 
     Args:
         field: whose rows they are.

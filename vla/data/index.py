@@ -171,9 +171,10 @@ def _lines(path: Path) -> list[bytes]:
 
 def _with_lost(entries: dict[int, Entry], lines: int) -> list[Entry]:
     """Return the readable entries with a `LOST` one for every seed between, before and after them that has none."""
-    (first, oldest), *_, (last, newest) = [*entries.items(), *entries.items()]
-    gone = int(first == 1 and oldest.start > 0)  # lines before the first, of which one at least had these rows
-    seeds = range(max(oldest.seed - first + 1 - gone, 0), newest.seed + lines - last + 1)
+    first, last = min(entries), max(entries)  # numbers of lines
+    oldest, newest = entries[first], entries[last]
+    cut_off = int(first == 1 and oldest.start > 0)  # lines at the start: the rows before the first one's were another's
+    seeds = range(max(oldest.seed - first + 1 - cut_off, 0), newest.seed + lines - last + 1)
     if len(seeds) > 2 * lines:  # a damaged line end joins two lines, so there are at most two seeds to a line
         raise UserError(f"the readable seeds, {oldest.seed} to {newest.seed}, are too far apart: {REMEDY}")
     known = {entry.seed: entry for entry in entries.values()}

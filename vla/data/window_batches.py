@@ -18,8 +18,7 @@ from vla.spec import Array, Spec
 
 Batch = dict[str, Any]
 
-# An executed action counts as perturbed if it differs from the label by more than this share of the label, and of the
-# action range.
+# An executed action is perturbed if it differs from the label by more than this share of the label, and of the range.
 SHARE_OF_LABEL, SHARE_OF_RANGE = 0.6, 0.05
 
 

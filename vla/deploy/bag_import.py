@@ -1,7 +1,6 @@
 """Import of ROS 2 bags as demonstrations: of a deployed policy, or of a person who moves the robot.
 
-All times are seconds since the first message of a bag. Shapes: N steps, J joints, P state components, D action
-components.
+Times are seconds since the first message of a bag. Shapes: N steps, J joints, P state and D action components.
 """
 
 from __future__ import annotations
@@ -52,6 +51,14 @@ class _Picture(NamedTuple):
     taken: float
 
 
+class _Followed(NamedTuple):
+    """What an arm follows at a time."""
+
+    number: int  # of the instruction: the same one may be given again
+    instruction: str
+    person: bool  # whether a person moves the arm to follow it, or the policy
+
+
 class _Segment(NamedTuple):
     """A time in which one instruction was followed, by the policy or a person."""
 
@@ -82,7 +89,7 @@ class _Bag:
         self.measured: Track = []  # joints (J,) [rad] and opening [m], together (J + 1,)
         self.commands: Track = []  # (J,) [rad]
         self.openings: Track = []  # commanded, 0 … 1
-        self._followed: list[tuple[int, str, bool] | None] = []  # at every joint state: instruction, person; or nothing
+        self._followed: list[_Followed | None] = []  # at every joint state
         self._instruction, self._said_at, self._number = "", -np.inf, 0
         self._used, self._dropped = set[str](), dict[str, str]()  # topics; topic → why its first message is unusable
         with opened(folder) as reader:
@@ -122,22 +129,24 @@ class _Bag:
                 raise UserError(f"{self.folder}: no message on {topic} can be used: {why}")
 
     def segments(self) -> Iterator[_Segment]:
-        """Yield the times in which an instruction was followed; those of a person from motion to rest."""
-        for what, group in groupby(zip(self._followed, self.measured, strict=True), key=itemgetter(0)):
+        """Yield the times in which an instruction was followed; those of a person while the arm moves."""
+        for followed, group in groupby(zip(self._followed, self.measured, strict=True), key=itemgetter(0)):
+            if followed is None:
+                continue
             times, positions = zip(*(measured for _, measured in group), strict=True)
             start, end = times[0], times[-1]
-            if what is not None and what[2]:
+            if followed.person:
                 scaled = np.array(positions) / [*[STILL] * len(self._limits.joints), STILL_OPENING]
-                began, ceased = (np.flatnonzero(np.abs(scaled - scaled[at]).max(1) > 1) for at in (0, -1))
-                start = max(times[began[0]] - LEAD, start) if len(began) else end
-                end = min(times[ceased[-1]] + LEAD, end) if len(ceased) else start
-            if what is not None and end - start >= SHORTEST:
-                yield _Segment(what[1], what[2], start, end)
+                left, on_way = (np.flatnonzero(np.abs(scaled - rest).max(1) > 1) for rest in (scaled[0], scaled[-1]))
+                start = max(times[left[0]] - LEAD, start) if len(left) else end
+                end = min(times[on_way[-1]] + LEAD, end) if len(on_way) else start
+            if end - start >= SHORTEST:
+                yield _Segment(followed.instruction, followed.person, start, end)
 
     def sees(self, camera: str, segment: _Segment) -> bool:
         """Return whether there are images of a camera in a segment."""
-        ends = ((bisect_left, segment.start), (bisect_right, segment.end))
-        first, stop = (bisect(self.inputs, at, key=WHEN) for bisect, at in ends)
+        first = bisect_left(self.inputs, segment.start, key=WHEN)
+        stop = bisect_right(self.inputs, segment.end, key=WHEN)
         pictures = (each for _, each in self.inputs[first:stop] if isinstance(each, _Picture))
         return any(each.camera == camera and each.taken >= segment.start for each in pictures)
 
@@ -154,8 +163,8 @@ class _Bag:
         taken = max(taken, self.measured[-1][0]) if self.measured else taken
         self.inputs.append((at, Measured(taken, *measured)))
         self.measured.append((taken, np.append(measured[0], measured[2])))
-        moved = self._instruction and self._person is not None
-        self._followed.append((self._number, self._instruction, bool(self._person)) if moved else None)
+        followed = _Followed(self._number, self._instruction, bool(self._person))
+        self._followed.append(followed if self._instruction and self._person is not None else None)
 
     def _instruct(self, at: float, message: Any) -> None:
         said = message.data.strip()
@@ -352,4 +361,4 @@ def _segments(bags: Sequence[_Bag], cameras: Sequence[str]) -> list[tuple[_Bag, 
             found.append((bag, segment))
     if found:
         return found
-    raise UserError(f"{bags[0].folder} has no instruction that an arm followed in view of {', '.join(cameras)}")
+    raise UserError(f"{bags[0].folder} has no instruction that was followed with images of {', '.join(cameras)}")

@@ -96,8 +96,7 @@ class JointStates:
 
     def read(self, message: Any, at: float) -> tuple[Array, Array, float] | None:
         """Read positions (J,) [rad], velocities (J,) [rad/s] and gripper opening [m] of a sensor_msgs/JointState
-        (UserError: a joint is missing, named twice or where the arm cannot be, the lengths differ, or a number is not
-        finite).
+        (UserError: a joint is missing, named twice or beyond limits, the lengths differ, or a number is not finite).
 
         Joints are found by name. Missing velocities, also NaN, become zero. A message with the fingers only returns
         None, and gives later ones the opening for as long as `FINGERS_AGE`.

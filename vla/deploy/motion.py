@@ -101,8 +101,7 @@ class Goals:
         """Return the goals of actions (k, D); the first one begins at the time of the observation (UserError: the
         actions have another shape or are not finite).
 
-        Cartesian actions are relative to the goal of the previous one, the first to the joints `anchor` (J,); joint
-        positions are absolute.
+        Cartesian actions are relative to the last goal, the first to the joints `anchor` (J,); joint positions are not.
         """
         if actions.ndim != 2 or not len(actions) or actions.shape[1] != len(self._spec.action):
             raise UserError(f"the policy returned actions of the shape {actions.shape}")

@@ -17,8 +17,7 @@ class DmEnvironment(dm_env.Environment):
     """Adapter of an `Environment` to dm_env.
 
     An observation is that of `vla.envs.gym.GymEnvironment`, with the `instruction` as an array of one string. The
-    reward is 1 for the step that succeeds, otherwise 0. The discount is 0 after success and failure, and 1 if an
-    episode ends at its time limit.
+    reward is 1 for the step that succeeds, else 0; the discount is 0 after success and failure, and 1 after a timeout.
     """
 
     def __init__(self, environment: Environment, random_state: int | np.random.RandomState | None = None) -> None:

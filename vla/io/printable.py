@@ -45,8 +45,7 @@ def show(renderable: Any) -> None:
 def track(items: Iterable[Item], description: str, total: float | None = None) -> Iterable[Item]:
     """Show a progress bar of an iteration.
 
-    It is painted here and not in threads: they deadlock where an iteration that was given up is collected in one of
-    them.
+    It is painted here: threads deadlock where an iteration that was given up is collected in one of them.
     """
     from rich import progress
 

@@ -56,8 +56,7 @@ def demonstration_spec(experiment: Experiment) -> Spec:
 def complete_store(experiment: Experiment) -> EpisodeStore | None:
     """Return the episode store of an experiment if it has enough episodes.
 
-    There is a UserError if the store was collected with another task, expert or first seed, or its images have other
-    losses.
+    There is a UserError if the store has another task, expert or first seed, or images with other losses.
     """
     wanted = experiment.collect
     if not is_store(Path(wanted.folder)):
@@ -70,8 +69,7 @@ def complete_store(experiment: Experiment) -> EpisodeStore | None:
 
 
 def _source(experiment: Experiment) -> tuple[Environment | SpecOnly, Spec, ImportedDemonstrations | None]:
-    """Return the world, closed, the spec of the demonstrations, and the recordings to import, or None for an acting
-    expert."""
+    """Return the closed world, the spec of the demonstrations, and the recordings to import: None if an expert acts."""
     world = experiment.world()
     expert = experiment.build("expert", spec=world.spec)
     recorded = expert if isinstance(expert, ImportedDemonstrations) else None

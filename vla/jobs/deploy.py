@@ -17,8 +17,7 @@ from vla.runs.folder import PLOT, REPORT
 def run(experiment: Experiment) -> None:
     """Run the deployment until done or interrupted; report a measured success rate like an evaluation.
 
-    There is a UserError if an episode to be played selected the weights; or one ended in an error, which the report
-    contains.
+    There is a UserError if an episode of the deployment selected the weights, or if one ended in an error.
     """
     seed, episodes = (at(experiment["deploy"], key, None) for key in ("simulator.seed", "episodes"))
     if experiment.checkpoint is not None and seed is not None and episodes is not None:

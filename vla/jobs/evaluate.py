@@ -193,14 +193,14 @@ def _play(
         clear(recordings)
     world = experiment.world() if wanted.until else None
     turns = len(world.tasks) if isinstance(world, Multitask) else 1
-    lanes = 1 if _is_shared(experiment) else (experiment["policy"] or {}).get("lanes", 1)  # else lanes are workers
+    lanes = 1 if _is_shared(experiment) else (experiment["policy"] or {}).get("lanes", 1)  # shared: workers are lanes
     play = partial(evaluate, cluster=experiment.cluster(), turns=turns, lanes=lanes, recordings=wanted.recordings)
     conditions, reports, seeds = _conditions(experiment, make_agent), dict[str, Report](), list(wanted.seeds)
-    until = (lambda so_far: all(each.is_decided(so_far) for each in statements)) if statements else None
-    for name, makers in conditions.items():
+    until = (lambda report: all(each.is_decided(report) for each in statements)) if statements else None
+    for name, (make_environment, make_its_agent) in conditions.items():
         first = name == IN_DISTRIBUTION
         reports[name] = play(
-            *(*makers, make_recorder if first else None, seeds),
+            *(make_environment, make_its_agent, make_recorder if first else None, seeds),
             name="as configured" if first else name,
             until=until if wanted.until else None,
             known=played.results[name],
@@ -211,8 +211,8 @@ def _play(
             until = partial(differs_clearly, reports[name], wanted.margin, len(conditions) - 1)
     tiers = experiment["task"].get("tiers") or {}  # of worlds that have them
     reports = {name: replace(report, tiers=tiers) for name, report in reports.items()}
-    # A condition that changes nothing is the first one.
-    return {name: reports.get(name, reports[IN_DISTRIBUTION]) for name in (IN_DISTRIBUTION, *wanted.changes, *reports)}
+    training = reports[IN_DISTRIBUTION]  # also the report of conditions that change nothing, which were not played
+    return {name: reports.get(name, training) for name in (IN_DISTRIBUTION, *wanted.changes, *reports)}
 
 
 def require_possible(experiment: Experiment) -> None:

@@ -42,8 +42,7 @@ EPISODES = "episodes"  # the store in the folder of a round
 def run(experiment: Experiment) -> float:
     """Improve a policy in rounds and return its success rate; finished rounds, and parts of one, are kept.
 
-    There is a UserError if the expert cannot label, seeds are not fresh, or a round of another policy lies in the
-    folder.
+    There is a UserError if the expert cannot label, seeds are not fresh, or the folder has a round of another policy.
     """
     seeds = _require_possible(experiment)
     known = complete_store(experiment)

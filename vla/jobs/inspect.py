@@ -39,8 +39,7 @@ def run(experiment: Experiment) -> None:
 def inspect_store(wanted: Inspection) -> None:
     """Verify and describe a store, or a new one made by merging, filtering or repair.
 
-    There is a UserError if the store does not exist, cannot be made, or is damaged; its intact episodes are described
-    first.
+    There is a UserError if the store cannot be read or made, or, after its intact episodes are described, is damaged.
     """
     findings = verify_store(EpisodeStore(_chosen(wanted), damaged=True))
     show(store_table(findings))

@@ -219,8 +219,7 @@ def _reported(
         ended = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
         raise
     finally:
-        # A training that cannot be resumed stays as it was. One that was interrupted after its last step has nothing
-        # to do, and does not start.
+        # A training that cannot be resumed stays as it was; one interrupted after its last step has nothing left to do.
         if trainer.is_global_zero and (graceful_stop.started or before is None or ended == "done" != before.ended):
             size = parameters, trainer.global_step, round(graceful_stop.seconds, 1)
             save_training(output, Training(*size, ended, origins))

@@ -44,8 +44,7 @@ class CVAEEncoder(nn.Module):
     def forward(self, robot_state: Tensor | None, action: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log variance, (B, Z) each, of the latent.
 
-        The inputs are the (B, robot_state_width) state, if it is used, (B, k, D) scaled actions and their (B, k) bool
-        mask.
+        Inputs: the (B, robot_state_width) state, if it is used, (B, k, D) scaled actions and their (B, k) bool mask.
         """
         before = self.start.weight.expand(len(action), 1, -1)
         if robot_state is not None:

@@ -112,23 +112,22 @@ def require_chunking(method: type, model: type, prefix: int) -> None:
 
 
 def require_prefix(prefix: int, execute: int, chunk: int) -> None:
-    """Raise a UserError if actions that training gives leave fewer of a chunk than are executed."""
+    """Raise a UserError if a chunk has fewer actions after its prefix than are executed."""
     if prefix + execute > chunk:
-        left = f"less than {execute} of the model.chunk={chunk} actions"
         raise UserError(
-            f"model.prefix={prefix} leaves {left}, which are executed: lower it or model.execute, or raise model.chunk"
+            f"model.chunk={chunk} has no room for model.prefix={prefix} and the model.execute={execute} actions that "
+            "follow it: lower one of these, or raise model.chunk"
         )
 
 
 def require_fit(method: type, model: Mapping[str, Any], delay: int) -> None:
-    """Raise a UserError if plans of the node of a model cannot be late by a delay [actions]."""
+    """Raise a UserError if the chunks of a model, given by its node, are too short for a delay [actions]."""
     chunk = model["chunk"]
-    after = max(delay, model["execute"] or chunk)
-    if delay + after > chunk:
+    interval = max(delay, model["execute"] or chunk)  # between one plan and the next
+    if delay + interval > chunk:
         raise UserError(
-            f"a plan that is late by {delay} actions ends before the next one, which follows {after} actions after it, "
-            f"as model.chunk={chunk}: train with a larger one, or lower the delay or model.execute"
+            f"plans begin {interval} actions apart and arrive {delay} late, when model.chunk={chunk} has run out: "
+            "train with a larger one, or lower the delay or model.execute"
         )
-    if issubclass(method, TrainedPrefix) and delay > model["prefix"]:
-        trained = f"model.prefix={model['prefix']}"
-        raise UserError(f"a plan is late by {delay} actions, more than the {trained} that it was trained for")
+    if issubclass(method, TrainedPrefix) and delay > (prefix := model["prefix"]):
+        raise UserError(f"plans arrive {delay} actions late, but the model was trained for model.prefix={prefix}")

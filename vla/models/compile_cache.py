@@ -14,8 +14,7 @@ def set_compile_cache() -> None:
     """Set PyTorch's cache folder of compiled graphs, unless it is set, to one per instruction set.
 
     A graph that was compiled for another instruction set silently computes other results or ends the process, and
-    PyTorch's cache key ignores the instruction set. PyTorch's own folder, which it sets as soon as it compiles
-    anything, counts as none.
+    PyTorch's cache key ignores the instruction set. PyTorch's own folder, which it sets itself, counts as none.
     """
     from torch._inductor.runtime.cache_dir_utils import default_cache_dir  # heavy: only for who compiles
 

@@ -97,8 +97,7 @@ class Decoder(ContextModel):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return logits: (B, L, K) and tokens: (B, L), the labels of the newest frame.
 
-        With an auxiliary head also truth: (B, 1, S), normalised. A batch with (B, T, N, E) "tokens" from `encode` needs
-        no images.
+        With an auxiliary head also truth: (B, 1, S), normalised. With (B, T, N, E) "tokens" from `encode` no images.
         """
         tokens = self.tokenizer.tokenize(batch["action"][:, -1])
         inputs = self.tokenizer.sampled(tokens, batch["action"][:, -1]) if self.training else tokens

@@ -1,7 +1,6 @@
 """Base class of diffusion and flow matching: the denoising network and its training.
 
-Shapes: B batch, k action chunk, D action components, M context tokens, E width of a token, R noisy copies, S truth
-scalars.
+Shapes: B batch, k action chunk, D action components, M context tokens, E their width, R noisy copies, S truth scalars.
 """
 
 from __future__ import annotations

@@ -18,8 +18,7 @@ Batch = dict[str, Any]
 class RunningNormalizer(nn.Module):
     """Normalisation to zero mean and unit variance by running statistics, which are saved with the weights.
 
-    Unlike batch normalisation it never uses the statistics of the current batch alone. Statistics are reduced over all
-    processes of a training.
+    Unlike batch normalisation it never uses the current batch alone; statistics are of all processes of a training.
 
     Args:
         width: number of components.

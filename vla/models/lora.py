@@ -88,8 +88,7 @@ def _linear(model: nn.Module, prefix: str = "") -> Iterator[str]:
 def without_lora(state: Mapping[str, Any], scale: float, named: Collection[str]) -> dict[str, Any]:
     """Return the state of a model as if there were no LoRA, and without the trunks `named`.
 
-    Weights get the product of their factors added. In a trunk the factors remain, as lora_A and lora_B, which has the
-    scale.
+    Weights get the product of their factors added. In a trunk the factors remain, as lora_A and the scaled lora_B.
     """
     plain = dict[str, Any]()
     for name, value in state.items():

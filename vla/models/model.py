@@ -207,7 +207,8 @@ class Model(nn.Module, ABC):
             raise UserError("learner.frozen leaves nothing to train")
         spared, groups = _embeddings(self), dict[tuple[float, bool], list[Tensor]]()
         for name, parameter in trained.items():
-            factor = rates[max(within, key=len)] if (within := [r for r in rates if is_within(name, [r])]) else 1.0
+            longest = max((part for part in rates if is_within(name, [part])), key=len, default=None)
+            factor = 1.0 if longest is None else rates[longest]
             decays = parameter.dim() > 1 and id(parameter) not in spared
             groups.setdefault((factor, decays), []).append(parameter)
         return [
@@ -219,14 +220,12 @@ class Model(nn.Module, ABC):
 def _require_parts(parameters: Collection[str], key: str, parts: Collection[str]) -> None:
     for part in parts:
         if not any(is_within(name, [part]) for name in parameters):
-            whole = part
-            while whole and not any(is_within(name, [whole]) for name in parameters):
-                whole = whole.rpartition(".")[0]
-            below = [name.removeprefix(f"{whole}.") for name in parameters if not whole or is_within(name, [whole])]
-            known = ", ".join(dict.fromkeys(name.partition(".")[0] for name in below))
-            raise UserError(
-                f"learner.{key} names {part}, which no parameter of the model is in: {whole or 'it'} has {known}"
-            )
+            known = part.rpartition(".")[0]  # the longest beginning of the name that is a part; "": the model
+            while known and not any(is_within(name, [known]) for name in parameters):
+                known = known.rpartition(".")[0]
+            below = [name.removeprefix(f"{known}.") for name in parameters if not known or is_within(name, [known])]
+            parts = ", ".join(dict.fromkeys(name.partition(".")[0] for name in below))
+            raise UserError(f"learner.{key} names {part}, which is no part of the model: {known or 'it'} has {parts}")
 
 
 def _embeddings(model: nn.Module) -> set[int]:

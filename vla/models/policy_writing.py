@@ -43,9 +43,9 @@ and in a program it is `vla.api.load_policy(FOLDER)`.
 
 
 def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write a policy, which replaces the one in `folder`, of what Lightning saves of a training.
+    """Write what Lightning saves of a training as a policy, which replaces the one in `folder`.
 
-    What is no tensor in the state of the model must be plain.
+    Values in the state of the model that are not tensors must be plain.
 
     Raises:
         OSError: it cannot be written; an existing one is unchanged.
@@ -55,13 +55,11 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
     config, spec = content["config"], content["spec"]
     names = (*files.REQUIRED_NODES, *files.OPTIONAL_NODES, "seed", "pretrained")
     nodes = {name: config[name] for name in names if name in config}
-    asked, seed = config.get("validate") or {}, config.get("seed")
-    validation = (asked["seed"], asked["episodes"]) if {"seed", "episodes"} <= asked.keys() else None
-    states = [part for part in content.values() if isinstance(part, dict)]  # that of the data module among them
-    windows = next((part["windows"] for part in states if isinstance(part.get("windows"), str)), "")
-    figures = {name: value for name, value in content["figures"].items() if math.isfinite(value)}
-    named = {name: Source(**source) for name, source in content.get("trunks", {}).items()}
-    state = without_lora(weights_of(content), content.get("lora_scale", 1.0), named)
+    validate = config.get("validate") or {}
+    # The data module saves the digest of the demonstrations, under a key of its class that is not known here.
+    states = [part for part in content.values() if isinstance(part, dict)]
+    trunks = {name: Source(**source) for name, source in content.get("trunks", {}).items()}
+    state = without_lora(weights_of(content), content.get("lora_scale", 1.0), trunks)
     # Contiguous, and without shared memory, as the format demands.
     tensors = {
         name: value.detach().cpu().clone(memory_format=torch.contiguous_format)
@@ -69,8 +67,16 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
         if isinstance(value, Tensor)
     }
     weights = save(tensors, {name: json.dumps(value) for name, value in state.items() if name not in tensors})
-    digest, steps, versions = hashlib.sha256(weights).hexdigest(), content["global_step"], installed_versions()
-    training = files.Training(steps, windows, seed, validation, digest, versions, figures, named)
+    training = files.Training(
+        steps=content["global_step"],
+        windows=next((part["windows"] for part in states if isinstance(part.get("windows"), str)), ""),
+        seed=config.get("seed"),
+        validation=(validate["seed"], validate["episodes"]) if {"seed", "episodes"} <= validate.keys() else None,
+        weights=hashlib.sha256(weights).hexdigest(),
+        versions=installed_versions(),
+        figures={name: value for name, value in content["figures"].items() if math.isfinite(value)},
+        trunks=trunks,
+    )
     count = sum(tensor.numel() for tensor in tensors.values())
     folder.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(folder) as draft:

@@ -61,8 +61,7 @@ class RT1(ContextModel, TokenModel):
         layers, heads, key_width: of the transformer.
         dropout: of attention weights and feed-forward outputs.
         position_std: standard deviation of the initial position embeddings. If it is small compared with the
-            tokens, every action slot first attends to the mean of all tokens, and the slots learn slowly to attend to
-            different ones.
+            tokens, all slots first attend to the mean of all tokens, and learn slowly to differ.
     """
 
     context: TokenContext

@@ -19,8 +19,7 @@ class Transforms:
     """The steps, which a policy has in its configuration as `model.image_size` and `model.fit`.
 
     Images are brought to the size of the demonstrations first, so that a sharper camera shows no more than training
-    did. Numbers are normalised within the model, by statistics that are saved with its weights, and absent frames of a
-    window are zero.
+    did. The model itself normalises numbers, by statistics saved with its weights. Absent frames of a window are zero.
 
     Args:
         sizes: height and width of the images of every camera, one after the other [px].

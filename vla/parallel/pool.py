@@ -1,7 +1,6 @@
 """The worker pool of collection, evaluation and exports.
 
-Every process creates its own worker at its first item and keeps it. A result depends on its item alone, so it is the
-same with any number of workers.
+Every process creates its own worker at its first item and keeps it. A result depends on its item alone.
 """
 
 from __future__ import annotations

@@ -151,8 +151,7 @@ def leave_with_parent() -> None:
 def ease_garbage_collection() -> None:
     """Let the cyclic garbage collector run seldom, and not at the end of the program.
 
-    Its passes during imports take a second and free little; those at the end would take up to two seconds to free what
-    ends with the process anyway.
+    Its passes during imports take a second and free little; those at the end, up to two, free what ends anyway.
     """
     gc.set_threshold(50_000, 20, 100)
     atexit.register(gc.freeze)

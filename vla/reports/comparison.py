@@ -75,10 +75,11 @@ def _compared(one: SweepRow, other: SweepRow, condition: str) -> dict[str, Compa
     if len(one.runs) == len(other.runs) == 1 and (together := common_episodes(*runs, condition)):
         return compared_in(together, anytime)
     first, second = (_by_seed(run, condition) for run in runs)
-    shared = first.keys() & second.keys()
-    alike = all(first[seed][1] == second[seed][1] for seed in shared)  # of samples all must be of the same world
-    alike = alike if shared else _scenes(runs[0], condition) == _scenes(runs[1], condition)
-    if anytime or not (first and second and alike):
+    if shared := first.keys() & second.keys():  # then each of them must be of the same world in both samples
+        same_world = all(first[seed][1] == second[seed][1] for seed in shared)
+    else:
+        same_world = _scenes(runs[0], condition) == _scenes(runs[1], condition)
+    if anytime or not (first and second and same_world):
         return {}
     samples = [effective_episodes(row.played[condition]) for row in (one, other)]
     episodes = one.episodes[condition] + other.episodes[condition]
@@ -89,21 +90,22 @@ def remarks(runs: Mapping[str, Run], compared: Compared | None = None) -> dict[s
     """Return remark → the runs, by name, that it is about; with comparisons also which pairs have none."""
     known = {(one, other) for other, one, _ in compared or ()}
     pairs = [] if compared is None else [pair for pair in combinations(runs, 2) if pair not in known]
-    versions: dict[str, dict[str, None]] = {}
-    for library, version in (each for run in runs.values() if run.report for each in run.report.versions.items()):
-        versions.setdefault(library, {})[version] = None
+    versions: dict[str, dict[str, None]] = {}  # library → its versions, in order and without repetition
+    for run in runs.values():
+        for library, version in run.report.versions.items() if run.report else ():
+            versions.setdefault(library, {})[version] = None
     failed = [
         f"{len(report.errors)} of {len(report.results)} in {name} ({condition})"
         for name, run in runs.items()
         for condition, report in run.reports.items()
         if report.errors
     ]
-    told = {
+    about = {
         "not compared, because no episode is the same in both": [f"{one} and {other}" for one, other in pairs],
         "evaluated with different versions": [f"{n} {' and '.join(v)}" for n, v in versions.items() if len(v) > 1],
         "episodes that ended in errors, which count nowhere": failed,
     }
-    return {remark: ", ".join(about) for remark, about in told.items() if about}
+    return {remark: ", ".join(names) for remark, names in about.items() if names}
 
 
 def difference_tables(compared: Compared) -> list[Table]:

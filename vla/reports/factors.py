@@ -51,8 +51,7 @@ def numeric(values: Sequence[Any]) -> bool:
 
 
 def groups(values: Sequence[Any]) -> list[list[int]]:
-    """Group the indices of the episodes: by value if there are few or they are words, numbers by quantiles, points by
-    quadrants around the median."""
+    """Group the indices of the episodes: by value if there are few or words, else by quantiles; points by quadrants."""
     if isinstance(values[0], tuple):
         values = [str(quarter) for quarter in np.array(values) > np.median(values, axis=0)]
     different = sorted(set(values), key=None if numeric(values) else str)

@@ -65,7 +65,8 @@ def errors_table(errors: Sequence[ComponentError], episodes: int) -> Table:
 
 def plot_errors(result: OpenLoop, path: Path) -> None:
     """Plot the errors as fractions of those of a constant action, and the actions of the episode of median error."""
-    typical = int(np.argsort((result.errors / result.errors.mean(0).clip(1e-12)).mean(1))[len(result.seeds) // 2])
+    relative = result.errors / result.errors.mean(0).clip(1e-12)  # components of any unit count alike
+    typical = int(np.argsort(relative.mean(1))[len(result.seeds) // 2])
     panels: Panels = {"error, as a fraction of a constant action's": partial(_plot_relative, result=result)}
     for index, name in enumerate(result.spec.action):
         title = name + in_brackets(result.spec.units[index])

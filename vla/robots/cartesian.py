@@ -28,8 +28,7 @@ TOLERANCE = 1e-4  # [m] and [rad]
 class Kinematics:
     """Facts of an arm that inverse kinematics needs."""
 
-    # Joints (J,) → pose (4, 4) of the tool in the base frame [m], and its Jacobian (6, J), linear rows [m/rad] before
-    # angular rows.
+    # Joints (J,) → pose (4, 4) of the tool in the base frame [m], and Jacobian (6, J), linear [m/rad] above angular.
     forward: Callable[[Array], tuple[Array, Array]]
     home: Array  # (J,) with the gripper pointing down over the table [rad]
     lowest: Array  # (J,) smallest positions [rad]
@@ -87,8 +86,7 @@ def solve(arm: Kinematics, target: Array, joints: Array, start: tuple[Array, Arr
 class CartesianController:
     """Turns Cartesian deltas into joint targets.
 
-    Deltas are relative to the last *commanded* pose: relative to the measured one, which lags, the arm would drift and,
-    with latency, oscillate.
+    Deltas are relative to the last *commanded* pose: the measured one lags, so that the arm would drift and oscillate.
     """
 
     # Names and units of the action components that it takes.

@@ -191,20 +191,20 @@ def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str
 
 
 def concluded(cases: Mapping[Key, Mapping[str, Comparison]], margin: float | None) -> dict[Key, dict[str, Comparison]]:
-    """Return the comparisons of all cases with verdicts: those in success take each other into account, so do others.
+    """Return the comparisons of all cases with verdicts, adjusted for their number in two families: of success or not.
 
-    Together they find a false difference with a probability of at most 5 %: S. Holm, "A simple sequentially rejective
+    Each family has a false difference with a probability of at most 5 %: S. Holm, "A simple sequentially rejective
     multiple test procedure", Scandinavian Journal of Statistics 6 (1979). Pairs that never differ cannot give a small
     p-value, so they do not count (R. E. Tarone, "A modified Bonferroni method for discrete data", Biometrics 46, 1990).
     """
-    every = [(case, name, each) for case, found in cases.items() for name, each in found.items()]
     verdicts: dict[tuple[Key, str], Comparison] = {}
     for of_success in (True, False):
-        family = [item for item in every if (item[1] == SUCCESS) == of_success]
-        left = sum(each.only_first is None or each.only_first + (each.only_second or 0) > 0 for _, _, each in family)
-        largest = 0.0
-        for case, name, each in sorted(family, key=lambda item: item[2].p):
-            largest = max(largest, min(1.0, max(left, 1) * each.p))
-            verdicts[case, name] = each.conclude(largest, margin if of_success else None)
-            left -= 1
-    return {case: {name: verdicts[case, name] for name in found} for case, found in cases.items()}
+        family = [((case, name), each) for case, of_case in cases.items() for name, each in of_case.items()]
+        family = [(key, each) for key, each in family if (key[1] == SUCCESS) == of_success]
+        can_differ = [each.only_first is None or each.only_first + (each.only_second or 0) > 0 for _, each in family]
+        remaining, adjusted = sum(can_differ), 0.0
+        for key, each in sorted(family, key=lambda item: item[1].p):
+            adjusted = max(adjusted, min(1.0, max(remaining, 1) * each.p))
+            verdicts[key] = each.conclude(adjusted, margin if of_success else None)
+            remaining -= 1
+    return {case: {name: verdicts[case, name] for name in of_case} for case, of_case in cases.items()}

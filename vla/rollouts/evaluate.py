@@ -47,18 +47,16 @@ def evaluate(
 ) -> Report:
     """Play the episodes of the seeds; `name` is the label of the progress bar.
 
-    `recordings` says which are recorded. Unless that is all, it is known at the end only which they are: these are
-    played once more. Every process of the `cluster` calls the factories once; agents that are `vla.spec.Agents` act in
-    so many `lanes` side by side in each. Errors of a factory end the evaluation; errors of an episode, or a crash of
-    its process, are reported in its result.
+    Every process of the `cluster` calls the factories once; agents that are `vla.spec.Agents` act in so many `lanes`
+    side by side in each. `recordings` says which episodes are recorded: unless it is all of them, they are chosen at
+    the end and played once more. Errors of a factory end the evaluation; an error or a crash of an episode is a result.
 
     With `until` the evaluation stops as soon as `until(report on the first n seeds)` is true; n is a multiple of
     `turns`, the number of tasks if seeds cycle through tasks. Results of later seeds are discarded, so that the report
     does not depend on the number of workers.
 
-    Episodes whose seeds are in `known`, seed → result, are not played again. `keep` is called with every other result
-    as soon as there is one, unless it is an error. There is a UserError if there are no seeds, seeds are in the range
-    of collection, or the cluster raises one.
+    Episodes whose seeds are in `known`, seed → result, are not played again. `keep` is called with every new result but
+    errors. There is a UserError if there are no seeds, seeds are in the range of collection, or the cluster raises one.
     """
     if not seeds or min(seeds) < FIRST_SEED:
         raise UserError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
@@ -75,17 +73,17 @@ def evaluate(
 def _play_missing(
     pool: Pool, score: _Score, recorded: bool, size: int, name: str, keep: Callable[[Result], None]
 ) -> None:
-    """Play what is missing in groups of `size`, until what counts suffices."""
+    """Play the missing episodes in groups of `size`, until `score.until` is true of the results that count."""
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
     with Progress(*columns, TimeRemainingColumn()) as progress:
         bar = progress.add_task("", total=len(score.seeds), completed=len(score.results))
-        missing = [] if score.clear() else [seed for seed in score.seeds if seed not in score.results]
+        missing = [] if score.advance() else [seed for seed in score.seeds if seed not in score.results]
         groups = [missing[first : first + size] for first in range(0, len(missing), size)]
         group_of, crashed = {pool.submit((group, recorded)): group for group in groups}, False
         for future in pool.as_completed(group_of):
             results = _results(future, group_of[future])
             crashed |= not results
-            if crashed and score.until is not None:  # what comes later does not count before these
+            if crashed and score.until is not None:  # later results count only after these
                 for later in group_of:
                     later.cancel()
                 break
@@ -94,17 +92,17 @@ def _play_missing(
                 if result.outcome != ERROR:
                     keep(result)
             progress.update(bar, completed=len(score.results), description=score.note())
-            if score.clear():
+            if score.advance():
                 for later in group_of:
                     later.cancel()
                 return
-    if crashed:  # each of the episodes that were played side by side alone
+    if crashed:  # one by one, to find out which of the episodes in a group it was
         _play_missing(pool, score, recorded, 1, name, keep)
 
 
 @dataclass
 class _Score:
-    """Results so far, in any order, of which those count that no missing one precedes."""
+    """Results so far, in any order; those count whose seeds come before the first that is missing."""
 
     seeds: Sequence[int]
     results: dict[int, Result]
@@ -116,8 +114,8 @@ class _Score:
         """Report the results that count."""
         return Report(tuple(self.results[seed] for seed in self.seeds[: self.counted]), anytime=self.until is not None)
 
-    def clear(self) -> bool:
-        """Count the results that no missing one precedes; return whether they suffice."""
+    def advance(self) -> bool:
+        """Count results up to the first that is missing, or until `until` is true of them; return whether it is."""
         while self.counted < len(self.seeds) and self.seeds[self.counted] in self.results:
             self.counted += 1
             if self.until is not None and self.counted % self.turns == 0 and self.until(self.report()):
@@ -132,8 +130,7 @@ class _Score:
 
 
 def _results(future: Future, seeds: Sequence[int]) -> list[Result]:
-    """Return the results of episodes that were played side by side; none if their process crashed, but of a single
-    one an error."""
+    """Return the results of a group of episodes; if its process crashed none, or an error if it is a single one."""
     try:
         return future.result()
     except Crashed as crash:

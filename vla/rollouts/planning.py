@@ -88,28 +88,29 @@ class Stopping:
 
 
 def stopping(mean: float, one: float, zero: float, enough: float, fixed: int) -> Stopping | None:
-    """Return how long evaluations take that stop as soon as observations of 0 and 1 exclude a mean.
+    """Return how long evaluations take that stop as soon as their observations, 0 or 1, exclude a `mean`.
 
-    That is a bar, or 1/2 for pairs, of which those count that differ. An episode gives a 1 and a 0 with the
-    probabilities `one` and `zero`; the share `enough` of the evaluations is to be decided, which would take `fixed`
-    episodes without stopping. Returns None if too few are decided after `HORIZON` times as many.
+    For one policy every episode is an observation, and `mean` is the bar; for two, a pair of episodes is one if just
+    one policy succeeds, and `mean` is 1/2. An episode gives a 1 and a 0 with the probabilities `one` and `zero`. The
+    share `enough` of the evaluations is to be decided, for which `fixed` episodes are needed without stopping. Returns
+    None if fewer are decided after `HORIZON` times as many.
     """
     from scipy.stats import binom
 
-    counting = one + zero
-    counts = np.arange(1, ceil(HORIZON * fixed * counting) + 11)  # of observations
+    observed = one + zero  # observations per episode
+    counts = np.arange(1, ceil(HORIZON * fixed * observed) + 11)  # of observations
     bounds = _largest_decisive(mean, counts), counts - _largest_decisive(1 - mean, counts)
-    ended, by_chance = _ends(bounds, one / counting), _ends(bounds, mean)
+    ended, by_chance = _ends(bounds, one / observed), _ends(bounds, mean)
 
     def decided(ended: Array, episodes: int) -> float:
         """Return the share of evaluations in which the observations of so many episodes decide."""
-        return float(ended @ binom.sf(counts - 1, episodes, counting))
+        return float(ended @ binom.sf(counts - 1, episodes, observed))
 
     most = episodes_needed(lambda episodes: decided(ended, episodes), enough) if ended.sum() > enough else None
     if most is None:
         return None
-    # Wald: of the episodes until the m-th observation, or `most`, the share `counting` are observations.
-    until = np.cumsum(binom.sf(counts - 1, most, counting)) / counting
+    # Wald: of the episodes until the m-th observation, or `most`, the share `observed` are observations.
+    until = np.cumsum(binom.sf(counts - 1, most, observed)) / observed
     return Stopping(most, float(ended @ until + (1 - ended.sum()) * most), decided(by_chance, most))
 
 

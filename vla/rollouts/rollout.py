@@ -19,8 +19,7 @@ def rollout(
 ) -> Episode:
     """Run the episode of `seed` to its end: `vla.rollouts.worlds.play` in one world.
 
-    There is a UserError if the agent returned an action of the wrong shape, or one that is not finite, or the episode
-    is over at its start.
+    There is a UserError if an action has the wrong shape or is not finite, or the episode is over at its start.
     """
     stage = Stage(environment, recorder)
     ((_, ended),) = play([stage], in_lanes(agent), [seed], recorder is not None, all_images)

@@ -18,7 +18,7 @@ from itertools import count
 from multiprocessing import AuthenticationError
 from multiprocessing.connection import Client, Connection, Listener
 from multiprocessing.shared_memory import SharedMemory
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -28,7 +28,14 @@ from vla.spec import Agents, Array, Environment, Observation, Running, Spec
 
 MOST = 1024  # workers
 
-Request = tuple[str, int, Any, Future[Any]]  # "act" or "plan", lane, observation; or "reset", lane, (instruction, seed)
+
+class Request(NamedTuple):
+    """What a worker wants of the policy."""
+
+    kind: str  # "act", "plan" or "reset"
+    lane: int
+    content: Any  # the observation; of "reset" instruction and seed
+    answer: Future[Any]
 
 
 class _Planner(Agents, Protocol):
@@ -77,8 +84,8 @@ def _serve(policy: _Planner, requests: queue.Queue[Request | None]) -> None:
                 waiting.append(another)
             requests.put(None)
         for kind, call in (("reset", partial(_reset, policy)), ("act", policy.act), ("plan", policy.plan)):
-            if alike := [request for request in waiting if request[0] == kind]:
-                _answer(call, alike)
+            if of_kind := [request for request in waiting if request.kind == kind]:
+                _answer(call, of_kind)
 
 
 def _reset(policy: _Planner, episodes: Sequence[tuple[str, int]], lanes: Sequence[int]) -> Sequence[None]:
@@ -88,44 +95,45 @@ def _reset(policy: _Planner, episodes: Sequence[tuple[str, int]], lanes: Sequenc
 def _answer(call: Callable[..., Iterable[Any]], requests: Sequence[Request]) -> None:
     """Answer requests together; where an observation is refused, one by one."""
     try:
-        answers = call([request[2] for request in requests], [request[1] for request in requests])
+        answers = call([request.content for request in requests], [request.lane for request in requests])
     except Exception as error:  # of any kind: the worker raises it
         for request in requests:
             if isinstance(error, ValueError) and len(requests) > 1:  # then no lane has acted
                 _answer(call, [request])
             else:
-                request[3].set_exception(error)
+                request.answer.set_exception(error)
     else:
         for request, answer in zip(requests, answers, strict=True):
-            request[3].set_result(answer)
+            request.answer.set_result(answer)
 
 
 def _talk(
     policy: _Planner, requests: queue.Queue[Request | None], lane: int, connection: Connection, spec: Spec
 ) -> None:
-    """Ask the policy what a worker asks, whose world has this spec, until it leaves."""
+    """Pass the requests of a worker, whose world has this spec, on to the policy until it leaves."""
     memory = SharedMemory(create=True, size=sum(_sizes(spec)))
     try:
         with connection, suppress(EOFError, OSError):  # it has left, or was killed
             connection.send((memory.name, policy.spec, policy.execute, policy.history))
             while True:
-                kind, instruction, given = connection.recv()
-                asked = (instruction, given) if kind == "reset" else _observation(memory, spec, instruction, given)
-                requests.put((kind, lane, asked, future := Future()))
-                error = future.exception()
-                done = None if error else (future.result(), policy.about(lane), policy.looking(lane))
+                kind, instruction, rest = connection.recv()
+                content = (instruction, rest) if kind == "reset" else _observation(memory, spec, instruction, *rest)
+                requests.put(Request(kind, lane, content, answer := Future()))
+                error = answer.exception()
+                done = None if error else (answer.result(), policy.about(lane), policy.looking(lane))
                 connection.send(portable(error) if error else done)
     finally:
         memory.close()
         memory.unlink()
 
 
-def _observation(memory: SharedMemory, spec: Spec, instruction: str, given: tuple[bool, Running | None]) -> Observation:
-    """Return a copy of what a worker sees: whether it gave images, and its running plan."""
-    images, running = given
-    seen = {name: view.copy() for name, view in _views(memory, spec).items()}
-    state = seen.pop("")
-    return Observation(seen if images else {}, state, instruction, running=running)
+def _observation(
+    memory: SharedMemory, spec: Spec, instruction: str, has_images: bool, running: Running | None
+) -> Observation:
+    """Return a copy of what a worker has written to its memory, with the rest of its observation."""
+    images = {name: view.copy() for name, view in _views(memory, spec).items()}
+    state = images.pop("")
+    return Observation(images if has_images else {}, state, instruction, running=running)
 
 
 def _sizes(spec: Spec) -> list[int]:
@@ -166,25 +174,26 @@ class _DistantPolicy:
 
     def act(self, observation: Observation) -> Array:
         """Return the action to execute, (D,) float32."""
-        return self._asked("act", observation)
+        return self._show("act", observation)
 
     def plan(self, observation: Observation) -> Array:
         """Return a chunk of actions, (k, D) float32."""
-        return self._asked("plan", observation)
+        return self._show("plan", observation)
 
-    def _asked(self, kind: str, observation: Observation) -> Array:
-        given: Mapping[str, Array] = {**observation.rgb, "": np.asarray(observation.state, np.float32)}
-        for name, place in _views(self._memory, self._world).items():
-            array = given.get(name, place)
-            if (array.shape, array.dtype) != (place.shape, place.dtype):
-                wanted, found = (f"{each.shape} {each.dtype}" for each in (place, array))
-                raise UserError(f"the world gives {name or 'a state'} of {wanted}, not {found}")
-            place[:] = array
-        images = all(camera in given for camera in self._world.cameras)
-        return self._ask(kind, observation.instruction, (images, observation.running))
+    def _show(self, kind: str, observation: Observation) -> Array:
+        """Write an observation to the shared memory, and ask for what answers it."""
+        arrays: Mapping[str, Array] = {**observation.rgb, "": np.asarray(observation.state, np.float32)}
+        for name, view in _views(self._memory, self._world).items():
+            array = arrays.get(name, view)
+            if (array.shape, array.dtype) != (view.shape, view.dtype):
+                expected, got = (f"{each.shape} {each.dtype}" for each in (view, array))
+                raise UserError(f"the world gives {name or 'a state'} of {expected}, not {got}")
+            view[:] = array
+        has_images = all(camera in arrays for camera in self._world.cameras)
+        return self._ask(kind, observation.instruction, (has_images, observation.running))
 
-    def _ask(self, kind: str, instruction: str, given: object) -> Any:
-        self._connection.send((kind, instruction, given))
+    def _ask(self, kind: str, instruction: str, rest: object) -> Any:
+        self._connection.send((kind, instruction, rest))
         answer = self._connection.recv()
         if isinstance(answer, Exception):
             raise answer

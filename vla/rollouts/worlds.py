@@ -114,7 +114,7 @@ class _Episode:
 
     seed: int
     instruction: str | None = None  # None: nothing was seen yet
-    everything: bool = False  # whether all images are rendered
+    all_images: bool = False  # whether all images are rendered
     blind: bool = False  # whether the newest observation has no images
 
 
@@ -123,13 +123,14 @@ def play(
 ) -> Iterator[tuple[int, Any]]:
     """Play the episodes of seeds side by side, on a stage per lane; yield seed → `Episode`, or its error, as they end.
 
-    Without `all_images`, images are rendered only at steps where the agent reads them. If a new instruction makes the
-    agent read an image that was not rendered, the episode is run again with all images. A new instruction resets the
-    agent. An error of a world or an agent ends the episodes that it concerns: a ValueError of agents those that raise
-    it when they act alone, because no lane has acted then, any other one all that were to act together.
+    A new instruction resets the agent. Without `all_images`, images are rendered only at steps where the agent reads
+    them; if a new instruction makes it read one that was not rendered, the episode is run again with all images.
 
-    A lane plays seeds that are its number modulo the number of lanes, as long as there are some: then policies, whose
-    rows are given by seeds, serve all lanes in one pass.
+    An error of a world, or in the reset of an agent, ends its episode. An error in `act` ends all that were to act
+    together; but after a ValueError, with which no lane has acted, each acts alone, and only those that fail again end.
+
+    As long as there are some, a lane plays seeds that are its number modulo the number of lanes: a policy, in which the
+    seed of an episode determines its row, then serves all lanes in one pass.
     """
     waiting, playing = list(seeds), dict[int, _Episode]()
     answers: dict[int, Any] = {}  # of the worlds: the next observation, the ended episode, or an error
@@ -138,30 +139,30 @@ def play(
             if waiting and lane not in playing:
                 fitting = next((seed for seed in waiting if seed % len(stages) == lane), waiting[0])
                 waiting.remove(fitting)
-                playing[lane] = _Episode(fitting, everything=all_images)
+                playing[lane] = _Episode(fitting, all_images=all_images)
                 answers[lane] = _tried(stage.reset, fitting, recorded)
-        asked, answers = answers, {}
-        seen: dict[int, Observation] = {}
+        arrived, answers = answers, {}
+        observations: dict[int, Observation] = {}
         ended: dict[int, Any] = {}
-        for lane, found in asked.items():
+        for lane, answer in arrived.items():
             try:
-                if not isinstance(found, Observation):
-                    ended[lane] = found
-                elif _follows(agents, lane, playing[lane], found):
-                    seen[lane] = found
-                else:
-                    playing[lane] = _Episode(playing[lane].seed, everything=True)
+                if not isinstance(answer, Observation):
+                    ended[lane] = answer
+                elif _follows(agents, lane, playing[lane], answer):
+                    observations[lane] = answer
+                else:  # an image is missing: play it again
+                    playing[lane] = _Episode(playing[lane].seed, all_images=True)
                     answers[lane] = _tried(stages[lane].reset, playing[lane].seed, recorded)
             except Exception as error:  # of any kind: agents are what people write
                 ended[lane] = error
-        for lane, action in _acted(agents, seen, len(stages[0].environment.spec.action)).items():
+        for lane, action in _acted(agents, observations, len(stages[0].environment.spec.action)).items():
             if isinstance(action, Exception):
                 ended[lane] = action
                 continue
-            playing[lane].blind = not playing[lane].everything and not agents.looking(lane)
+            playing[lane].blind = not playing[lane].all_images and not agents.looking(lane)
             answers[lane] = _tried(stages[lane].step, action, agents.about(lane), playing[lane].blind)
-        for lane, found in ended.items():
-            yield playing.pop(lane).seed, found
+        for lane, result in ended.items():
+            yield playing.pop(lane).seed, result
 
 
 def _tried(call: Callable[..., Any], *arguments: Any) -> Any:
@@ -190,16 +191,16 @@ def _acted(agents: Agents, seen: Mapping[int, Observation], components: int) -> 
     except ValueError as error:
         if len(lanes) == 1:
             return {lanes[0]: error}
-        return {lane: found for each in lanes for lane, found in _acted(agents, {each: seen[each]}, components).items()}
+        return {lane: _acted(agents, {lane: seen[lane]}, components)[lane] for lane in lanes}
     except Exception as error:  # of any kind: agents are what people write
         return dict.fromkeys(lanes, error)
-    found: dict[int, Array | Exception] = {}
+    acted: dict[int, Array | Exception] = {}
     for lane, action in zip(lanes, actions, strict=True):
-        found[lane] = action
+        acted[lane] = action
         if action.shape != (components,) or not np.isfinite(action).all():
             name = type(agents.agent if isinstance(agents, _Alone) else agents).__name__
-            found[lane] = UserError(f"{name} must return {components} finite numbers, got {action}")
-    return found
+            acted[lane] = UserError(f"{name} must return {components} finite numbers, got {action}")
+    return acted
 
 
 def copied(seen: Observation) -> Observation:

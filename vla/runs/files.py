@@ -145,7 +145,7 @@ class ReportFile:
         if [result.seed for result in self.per_episode] != self.seeds:
             raise UserError("per_episode has other episodes than seeds")
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
-            raise UserError("seeds has none, or one of them twice")
+            raise UserError("seeds is empty, or has the same seed twice")
         for name, condition in self.conditions.items():
             played = len(condition.outcomes)
             if played > len(self.seeds) or (played < len(self.seeds) and not condition.anytime):

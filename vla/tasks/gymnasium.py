@@ -89,8 +89,9 @@ class Gymnasium(World):
             values = self._values(*self._environment.reset(seed=0))
         except Error as error:  # such as a library for drawing that is missing
             raise UserError(f"task.id={id} cannot be played: {error}") from error
-        labels = zip(state.items(), _labels([*state]), strict=True)
-        names = [name for (path, given), label in labels for name in _named(path, _get(values, path), given, label)]
+        names = list[str]()
+        for (path, components), label in zip(state.items(), _labels([*state]), strict=True):
+            names += _named(path, _get(values, path), components, label)
         actions = _named("action", space.low, action, "action")
         state_units, action_units = units_of(units, names, actions)
         rate = control_hz or self._environment.metadata.get("render_fps")
@@ -143,11 +144,11 @@ class Gymnasium(World):
         return {OBSERVATION: observation, INFO: info, **({RENDER: self._environment.render()} if drawn else {})}
 
     def _observe(self, values: Mapping[str, Any]) -> Observation:
-        images = {} if self._blind else self._images
+        images, instruction = {} if self._blind else self._images, self._instruction
         return Observation(
             rgb={name: _resized(name, _get(values, path), self._size) for name, path in images.items()},
             state=np.concatenate([np.ravel(_get(values, path)) for path in self._state]).astype(np.float32),
-            instruction=str(_get(values, said)) if (said := self._instruction).startswith(PATHS) else said,
+            instruction=str(_get(values, instruction)) if instruction.startswith(PATHS) else instruction,
             truth={name: np.ravel(_get(values, path)).astype(np.float32) for name, path in self._truth.items()},
         )
 
@@ -215,8 +216,7 @@ def _labels(paths: Sequence[str]) -> Sequence[str]:
 
 
 def _named(path: str, values: Any, names: Names | None, label: str) -> tuple[str, ...]:
-    """Return the names of the components of an array, by default a label and numbers; a UserError if there are more or
-    fewer components than names."""
+    """Return the names of an array's components, by default numbered labels; a UserError if there are not as many."""
     size = np.size(values)
     if names is None:
         return tuple(f"{label}_{index}" for index in range(size))

@@ -36,8 +36,7 @@ class GracefulStop(Checkpoint):
 
     At the first SIGINT or SIGTERM it saves and stops after the current step, in all processes together, at the second
     at once. Where a validation follows a step, it comes first: a checkpoint from before would skip it when resumed. As
-    a Lightning `Checkpoint` it runs after all other callbacks. It adds `finished` and the training time `seconds` to
-    every checkpoint.
+    a Lightning `Checkpoint` it runs after all other callbacks. It saves `finished` and the training time, `seconds`.
     """
 
     def __init__(self, checkpoints: Path) -> None:

@@ -26,7 +26,7 @@ from vla.training.device import memory_of
 
 log = logging.getLogger(__name__)
 
-ROOM = 3  # memory that a model needs in a process of its own, in that of its weights: it arrives, and acts
+ROOM = 3  # memory of a process with a model, as a multiple of its weights: they arrive pickled, and the model acts
 PER_WORKER = 5  # episodes; for fewer, a process takes longer to start than they take
 
 
@@ -55,8 +55,7 @@ class ClosedLoop(Callback):
 
     The processes of a training split the episodes, and each has workers that share its part; a result does not depend
     on their number. The policy with the highest success rate is saved as `policy_best`; ties go to the newest. With
-    sharded weights nothing is played, because all processes would have to act in step. It is a context, at whose end
-    the workers end.
+    sharded weights nothing is played: all processes would have to act in step. Its workers end with the context.
 
     Args:
         make_environment: factory of the environment, called for every validation, after which it is closed.
@@ -121,10 +120,9 @@ class ClosedLoop(Callback):
             pl_module.log("val/success", self.success, sync_dist=True)
 
     def play(self, learner: Learner, seeds: Sequence[int], workers: int) -> list[Result]:
-        """Return the results of the episodes of seeds with the weights of now.
+        """Return the results of the episodes of seeds with the present weights.
 
-        They are played in so many worker processes, as far as there is memory for a model in each, or in this one if
-        there would be only one.
+        As many worker processes play them as have memory for a model each; if that is one only, this process plays.
         """
         size = sum(weight.nbytes for weight in learner.model.parameters())
         workers = min(workers, int(memory_of(learner.device)[1] / (ROOM * size)))

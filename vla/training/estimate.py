@@ -25,7 +25,8 @@ from vla.training.trainer import what_to_lower
 
 log = logging.getLogger(__name__)
 
-TRIALS_S, MANY = 2.0, 500  # trials of larger batches end after this time [s], unless a training has so many batches
+TRIALS_S = 2.0  # after which no larger batch is tried [s], unless the training is long
+LONG = 500  # batches of a long training, whose trials go on up to the size of its batches
 TOLERANCE = 1.15  # a training is refused if it needs that much more than there is
 SCARCE = 0.5  # share of the memory above which a training says what to lower
 OPTIMIZED = 20_000_000  # numbers that a step of the optimiser is timed with
@@ -37,8 +38,7 @@ class Estimate(Callback):
     """Estimates memory and time of a training from a few steps with small batches, without changing it.
 
     Trials of 2, 8, 32, … windows end at the size of the training's batches, or, in a short training, once they take
-    long; then the line through the last two tells the rest. What trials lack is counted: optimiser state, EMA weights
-    and waiting batches.
+    long; then the line through the last two tells the rest. Optimiser state, EMA weights and waiting batches are added.
 
     Args:
         config: of the training, to name what can be lowered.
@@ -96,10 +96,11 @@ class Estimate(Callback):
             if windows == data.batch_size:
                 return window
             following = min(4 * windows, data.batch_size)
-            spent = time.perf_counter() - began + 2 * self._seconds[windows] * following / windows
-            soon = spent < (TRIALS_S if windows > 2 else 5 * TRIALS_S) or not 0 <= batches_left(trainer) < MANY
+            spent = time.perf_counter() - began + 2 * self._seconds[windows] * following / windows  # after two steps
+            long = not 0 <= batches_left(trainer) < LONG
+            affordable = long or spent < (TRIALS_S if windows > 2 else 5 * TRIALS_S)  # a line needs a second trial
             fits = extrapolated(self._peaks, following) < self._available
-            if not trainer.strategy.reduce_boolean_decision(soon and fits, all=True):
+            if not trainer.strategy.reduce_boolean_decision(affordable and fits, all=True):
                 return window
             windows = following
 

@@ -135,8 +135,7 @@ def action_bounds(values: Array) -> tuple[float, float]:
     """Return bounds for a component of the actions, given its values (N,).
 
     They are the smallest and the largest value, unless one is an outlier: further from the quantiles than
-    `OUTLIER_MARGIN` times the distance between these. A component that hardly moves, such as a gripper that closes
-    once, has none.
+    `OUTLIER_MARGIN` times the distance between these. A component that hardly moves, such as a gripper, has none.
     """
     least, most = float(values.min()), float(values.max())
     low, high = (float(quantile) for quantile in np.quantile(values, OUTLIER_QUANTILES))
@@ -147,8 +146,7 @@ def action_bounds(values: Array) -> tuple[float, float]:
 
 
 def out_of_bounds(actions: Array, spec: Spec, most: float) -> list[str]:
-    """Describe the components of which more than the share `most` of the (N, D) actions exceeds the bounds of a spec:
-    they have other units."""
+    """Describe components that exceed the bounds in more than the share `most` of the (N, D) actions: other units."""
     found = list[str]()
     for index, (name, low, high) in enumerate(zip(spec.action, spec.low, spec.high, strict=True)):
         values, slack = actions[:, index], BOUNDS_TOLERANCE * (high - low)

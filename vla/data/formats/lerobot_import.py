@@ -24,8 +24,7 @@ from vla.spec import Array, Episode, Spec
 Keys = Annotated[list[Text], MinLen(1), Predicate(unique)]
 Places = Mapping[str, tuple[str, int]]  # component → feature and index
 
-# Largest share of a component's actions beyond its bounds; a larger one means other units. Bounds from quantiles
-# exclude 2 % of the actions.
+# Share of a component's actions beyond its bounds that means other units: bounds from quantiles exclude 2 %.
 MAX_OUTSIDE = 0.02
 MAX_NAMES = 200  # characters of names from a dataset in a message
 
@@ -73,21 +72,21 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         features = dataset.info.features
         self._state = dataset.components(state, [spec.state[index] for index in spec.pose], in_order)
         self._action = dataset.components(action, spec.action, in_order)
-        rates = [key for key in (layout.RATES,) if key in features and features[key].components]
-        for name, place in dataset.components(rates).items():
-            self._state.setdefault(name, place)
-        told = dataset.components([layout.EXECUTED]) if layout.EXECUTED in features else {}
-        executed = [layout.EXECUTED] if all(name in told for name in spec.action) else []
-        self._lacks = [*(["depth"] if spec.depth else []), *([] if executed else [layout.EXECUTED])]
+        rates = [layout.RATES] if layout.RATES in features and features[layout.RATES].components else []
+        self._state |= {name: at for name, at in dataset.components(rates).items() if name not in self._state}
+        executed = dataset.components([layout.EXECUTED]) if layout.EXECUTED in features else {}
+        has_executed = all(name in executed for name in spec.action)
+        self._lacks = ["depth"] if spec.depth else []
+        self._lacks += [] if has_executed else [layout.EXECUTED]
         self._lacks += [] if all(name in self._state for name in spec.state) else [layout.RATES]
         differences = [*self._mismatches()]
         if all(name in self._action for name in spec.action):
-            read = [*state, *action, *rates, *executed]
-            self._numbers = dataset.read(list(dict.fromkeys(read)))
+            keys = [*state, *action, *rates, *([layout.EXECUTED] if has_executed else [])]
+            self._numbers = dataset.read(list(dict.fromkeys(keys)))
             factors = _factors(scale, spec.action)
             self._actions = self._columns(spec.action, self._action, slice(None)) * factors
-            if executed:
-                self._executed = self._columns(spec.action, told, slice(None)) * factors
+            if has_executed:
+                self._executed = self._columns(spec.action, executed, slice(None)) * factors
             differences += imported.out_of_bounds(self._actions, spec, MAX_OUTSIDE)
         if differences:
             raise UserError(f"{dataset.folder} does not match the task: {'; '.join(differences)}")

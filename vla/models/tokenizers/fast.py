@@ -1,7 +1,6 @@
 """FAST: a chunk of actions as a short token sequence, by cosine transform and byte-pair encoding (arXiv 2501.09747).
 
-Shapes: k actions of a chunk, D action components, L tokens of a sequence, K tokens of the vocabulary, … leading
-dimensions.
+Shapes: k actions of a chunk, D action components, L tokens of a sequence, K of the vocabulary, … leading dimensions.
 """
 
 from __future__ import annotations
@@ -30,8 +29,7 @@ class Fast(ActionTokenizer):
     """Byte-pair encoding of the rounded cosine transform of each component, low frequencies first.
 
     Smooth motions have few non-zero coefficients, and byte-pair encoding merges frequent sequences, so the length
-    varies, up to k·D tokens and an end token. A generated sequence with too few coefficients is filled up with 0, one
-    with too many is cut.
+    varies, up to k·D tokens and an end token. In generated ones missing coefficients are 0, surplus ones are cut.
 
     A chunk counts in the loss as a whole, and only if nothing in it is perturbed.
 

@@ -1,7 +1,6 @@
 """Action tokenizers: a chunk of actions as a sequence of tokens from a vocabulary of K.
 
-Shapes: D action components, k actions of a chunk, L tokens of the longest sequence of a batch, K bins, … any leading
-dimensions.
+Shapes: D action components, k actions of a chunk, L tokens of a batch's longest sequence, K bins, … leading axes.
 """
 
 from __future__ import annotations

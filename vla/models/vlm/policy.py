@@ -215,8 +215,7 @@ def last_of(known: Prefix) -> Tensor:
 def resize_with_padding(images: Tensor, size: int, place: Place) -> Tensor:
     """Resize (B, 3, H, W) float images to (B, 3, size, size), bilinear, with black borders for other aspect ratios.
 
-    They are not antialiased, because the pretrained policies have seen them so: in the bottom right "corner", or in the
-    "centre".
+    They are not antialiased, as the pretrained policies have seen them: in the bottom right "corner", or the "centre".
     """
     height, width = images.shape[2:]
     ratio = max(width / size, height / size)

@@ -78,8 +78,7 @@ class Prompt(TextEncoder):
         return _padded(rows, min(self.length, -longest % STEP + longest))
 
     def forward(self, tokens: Tensor, state: Tensor | None = None) -> Tensor:
-        """Return the tokens of whole prompts, (B, L) at most, given the output of `tokenize` and the (B, S) normalised
-        state."""
+        """Return the tokens of whole prompts, (B, ≤ L), from the output of `tokenize` and the (B, S) scaled state."""
         if not self.state:
             return tokens
         assert state is not None

@@ -54,8 +54,7 @@ class Controller:
         self._unnoticed = True
 
     def step(self, data: mujoco.MjData, action: Array) -> None:
-        """Apply an action (7,) of -1…1 for 50 ms: displacement and rotation vector in the world's axes, gripper (1
-        closes)."""
+        """Apply an action (7,) of -1…1 for 50 ms: displacement and rotation vector in the world, gripper (1 closes)."""
         move = np.clip(action[:6], -1, 1) * REACH
         for substep in range(SUBSTEPS):
             mujoco.mj_step1(self._model, data)

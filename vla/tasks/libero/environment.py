@@ -10,7 +10,7 @@ import numpy as np
 from annotated_types import Ge, Le, MinLen, Predicate
 
 from vla.io.errors import UserError
-from vla.io.types import ImageSize, Names, Natural, unique
+from vla.io.types import ImageSize, Names, Natural, Share, unique
 from vla.spec import FIRST_SEED, Array, Observation, Spec
 from vla.tasks.libero.controller import REACH, Controller
 from vla.tasks.libero.goal import Goal
@@ -115,10 +115,9 @@ class Libero(ManyTasks):
         turn = (seed - FIRST_SEED) // len(self._tasks)
         fixed = self._starts_of == "official" or (self._starts_of == "by_seed" and seed >= FIRST_SEED)
         state = turn % len(starts) if fixed else None
-        random, asked = np.random.default_rng(seed), self._randomize
-        exchanged, coloured = (
-            state is None and share > 0 and bool(random.random() < share) for share in (asked.places, asked.colours)
-        )
+        random = np.random.default_rng(seed)
+        exchanged = state is None and _happens(self._randomize.places, random)
+        coloured = state is None and _happens(self._randomize.colours, random)
         start = starts.drawn(random, exchanged) if state is None else starts.official(state)
         self.draws = {
             "start": {"official": -1 if state is None else state, "exchanged": exchanged, "coloured": coloured}
@@ -143,10 +142,10 @@ class Libero(ManyTasks):
     def _look(self) -> Observation:
         scene = self._scene
         pictures = () if self._blind else scene.pictures(self._mirror)
-        part = (*self._goal.todo(scene.data), *self._goal.parts)[0]  # what is to be done next
+        following = (*self._goal.todo(scene.data), *self._goal.parts)[0]  # what is to be done next
         truth = {
-            "object": scene.position(part[1]),
-            "goal": scene.position(part[-1]),
+            "object": scene.position(following.thing),
+            "goal": scene.position(following.place or following.thing),
             "reach": self.tool - scene.base,  # the surface that things stand on is at the height of the base
             "task": np.array([ALL.index(self._task.suite), self._task.number]),
             "positions": scene.data.qpos.copy(),
@@ -253,6 +252,11 @@ def _materials(model: mujoco.MjModel, task: Task) -> list[list[int]]:
 def _things(task: Task) -> set[str]:
     """Return the names of the movable things in a scene."""
     return {part[1] for part in task.initial if part[0] in ("on", "in")} - task.fixtures.keys()
+
+
+def _happens(share: Share, random: np.random.Generator) -> bool:
+    """Draw whether this start is in a share of all starts; a share of 0 takes no random number."""
+    return share > 0 and bool(random.random() < share)
 
 
 def command_of(action: Array) -> Array:

@@ -66,35 +66,41 @@ class Planner:
 
 def decide(at: Situation) -> Array:
     """Return the command (7,) for a state."""
-    todo = at.goal.todo(at.data)
-    touched = at.touched()
+    todo, touched = at.goal.todo(at.data), at.touched()
     held = touched if at.opening < HELD and at.gap > THIN else None
-    if not todo or (touched is not None and all(at.subject(part[1]) != touched for part in todo)):
-        done = next((part for part in at.goal.parts if todo and part[1] == held), None)
-        if done is not None and done[0] == "in" and at.subject(done[2]).startswith(HOLLOWS):
-            place = place_of(at, done[1], done[2], True)
-            if np.linalg.norm(place.spot - at.origin(done[1])) > ARRIVED:
-                return carry(at, done[1], place)  # it counts as there, but it is not down or not far enough in yet
-        if done is not None and done[0] == "on":
-            return let_go(at, done[1])
-        return command(at, at.hand, at.yaw, -1.0, at.lean)
-    part = next((part for part in todo if held is not None and part[1] == held), todo[0])
-    if part[0] in ("on", "in") and _shut(at, part[2], SLIPPED if part[1] == held else 0.0):
-        if part[1] == held:
-            return command(at, at.hand, at.yaw, -1.0, at.lean)
-        aside = in_the_way(at, part[1], int(at.goal.joints(part[2])[0]))
-        if aside is not None and at.upright:
-            return drag(at, part[1], aside)
-        part = ("open", part[2])
-    if part[0] == "open":
-        return pull(at, part[1])
+    if not todo:
+        return _open_fingers(at)
+    if touched is not None and all(at.subject(part.thing) != touched for part in todo):
+        return _release(at, held)
+    name, thing, place = next((part for part in todo if part.thing == held), todo[0])
+    if name in ("on", "in") and _shut(at, place, SLIPPED if thing == held else 0.0):
+        if thing == held:  # the hand is needed to open the drawer
+            return _open_fingers(at)
+        aside = in_the_way(at, thing, int(at.goal.joints(place)[0]))
+        return pull(at, place) if aside is None or not at.upright else drag(at, thing, aside)
+    if name == "open":
+        return pull(at, thing)
     if not at.upright:
         return withdraw(at)
-    if part[0] in ("turnon", "turnoff"):
-        return twist(at, part[1], TWIST if part[0] == "turnon" else -TWIST)
-    if part[0] == "close":
-        return push(at, part[1])
-    return _deliver(at, part[1], part[2], part[1] == held)
+    if name in ("turnon", "turnoff"):
+        return twist(at, thing, TWIST if name == "turnon" else -TWIST)
+    if name == "close":
+        return push(at, thing)
+    return _deliver(at, thing, place, thing == held)
+
+
+def _open_fingers(at: Situation) -> Array:
+    return command(at, at.hand, at.yaw, -1.0, at.lean)
+
+
+def _release(at: Situation, held: str | None) -> Array:
+    """Let go of what needs nothing more, once it lies where the goal wants it."""
+    done = next((part for part in at.goal.parts if part.thing == held), None)
+    if done is not None and done.name == "in" and at.subject(done.place).startswith(HOLLOWS):
+        place = place_of(at, done.thing, done.place, True)
+        if np.linalg.norm(place.spot - at.origin(done.thing)) > ARRIVED:
+            return carry(at, done.thing, place)  # it counts as there, but it is not down or not far enough in yet
+    return let_go(at, done.thing) if done is not None and done.name == "on" else _open_fingers(at)
 
 
 def _deliver(at: Situation, thing: str, where: str, held: bool) -> Array:

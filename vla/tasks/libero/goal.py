@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -23,13 +24,21 @@ SLACK = 0.01  # depth under the box of a region to lie in [m]
 ORDER = ("open", "turnon", "on", "in", "close", "turnoff")  # in which parts of a goal can be done
 
 
+class Predicate(NamedTuple):
+    """One part of a goal."""
+
+    name: str  # one of `ORDER`
+    thing: str
+    place: str = ""  # thing or region, for "on" and "in"
+
+
 class Goal:
     """A conjunction of predicates on things: bodies named `THING_main`, or sites, the regions."""
 
     def __init__(self, model: mujoco.MjModel, goal: Sequence[Sequence[str]]) -> None:
         """Args: the model of a scene; predicates with their arguments, as in `Task.goal`."""
         self._model = model
-        self.parts = sorted((tuple(part) for part in goal), key=lambda part: ORDER.index(part[0]))
+        self.parts = sorted((Predicate(*part) for part in goal), key=lambda part: ORDER.index(part.name))
         names = [model.body(number).name for number in range(model.nbody)]
         self.bodies = {name.removesuffix("_main"): n for n, name in enumerate(names) if name.endswith("_main")}
         self.sites = {model.site(number).name: number for number in range(model.nsite)}
@@ -42,7 +51,7 @@ class Goal:
         """Return whether all predicates hold."""
         return all(self.holds(data, *part) for part in self.parts)
 
-    def todo(self, data: mujoco.MjData) -> list[tuple[str, ...]]:
+    def todo(self, data: mujoco.MjData) -> list[Predicate]:
         """Return the predicates that do not hold, in an order in which they can be fulfilled."""
         return [part for part in self.parts if not self.holds(data, *part)]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -40,19 +41,21 @@ def choose_grasp(at: Situation, thing: str, place: Place) -> Grasp | None:
     points = at.points(thing)
     tilted = np.abs(at.data.xmat[at.goal.bodies[thing], 6:]).max() < UPRIGHT  # whichever of its axes is up
     kinds = (crest(points),) if tilted else (across(points), walls(points), parts(at.pieces(thing)), leaning(points))
-    best: tuple[float, float, Grasp] | None = None
+    best: Grasp | None = None
+    lowest_cost = hindered = math.inf  # of the best one, with the way there and its width, and without
     for least, kind in zip(KINDS, kinds, strict=False):
-        if best is not None and best[1] < least:
+        if hindered < least:
             break  # what is in its way costs less than another kind
-        found = [(width, grasp) for width, grasp in kind if gap_of(grasp, points) > 0]
-        if not found:
+        if not (fitting := [(width, grasp) for width, grasp in kind if gap_of(grasp, points) > 0]):
             continue
-        moves, hindrances = _costs(at, thing, [one for _, one in found], place)
-        costs = least + np.array([width for width, _ in found]) + moves + hindrances
-        one = int(np.argmin(costs))
-        if best is None or costs[one] < best[0]:
-            best = float(costs[one]), float(least + hindrances[one]), found[one][1]
-    return None if best is None else best[2]
+        widths, grasps = zip(*fitting, strict=True)
+        moves, hindrances = _costs(at, thing, grasps, place)
+        costs = least + np.array(widths) + moves + hindrances
+        cheapest = int(np.argmin(costs))
+        if costs[cheapest] < lowest_cost:
+            best, lowest_cost = grasps[cheapest], float(costs[cheapest])
+            hindered = float(least + hindrances[cheapest])
+    return best
 
 
 def room_of(at: Situation, thing: str, grasp: Grasp) -> float:

@@ -69,11 +69,11 @@ def way_out(at: Situation, thing: str, over: Array, held: bool, margin: float = 
         return None
     starts = np.column_stack([origin[:2] + 0.02 * WAYS, np.full(len(WAYS), points[:, 2].max() - 0.02)])
     gaps = clearance(starts, np.arctan2(WAYS[:, 1], WAYS[:, 0]), _flat(over))
-    rest = at.others(thing, origin, 0.3)
-    rest = rest[rest[:, 2] > points[:, 2].min() + FLOOR]
-    return form.out(
-        origin, rest, 0.0 if held else 3 * np.maximum(0, CLEAR - gaps), over, margin, SLIT if held else PUSHED
-    )
+    obstacles = at.others(thing, origin, 0.3)
+    obstacles = obstacles[obstacles[:, 2] > points[:, 2].min() + FLOOR]
+    if held:
+        return form.out(origin, obstacles, 0.0, over, margin, SLIT)
+    return form.out(origin, obstacles, 3 * np.maximum(0, CLEAR - gaps), over, margin, PUSHED)
 
 
 def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
@@ -84,39 +84,39 @@ def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
         near = support[np.linalg.norm(support[:, :2] - middle[:2], axis=1) < 0.03]
         return Place(np.array([*middle[:2], (near if len(near) else support)[:, 2].max() + below + 0.004]))
     site = at.goal.sites[where]
-    middle, turn = at.data.site_xpos[site], at.data.site_xmat[site].reshape(3, 3)
-    extent = np.abs(turn) @ at.model.site_size[site]  # of the region along the axes of the world
+    middle, axes = at.data.site_xpos[site], at.data.site_xmat[site].reshape(3, 3)
+    extent = np.abs(axes) @ at.model.site_size[site]  # of the region along the axes of the world
     floor = _floor(at, where, middle, extent)
     spots = np.column_stack([middle[:2] + GRID * extent[:2], np.full(len(GRID), floor + below + 0.01)])
-    rest = at.others(thing, middle, float(extent[:2].max()) + 0.15)
-    rest = rest[rest[:, 2] > floor + FLOOR]
-    away = 0.1 * np.linalg.norm(spots[:, :2] - middle[:2], axis=1)
-    options = []
+    obstacles = at.others(thing, middle, float(extent[:2].max()) + 0.15)
+    obstacles = obstacles[obstacles[:, 2] > floor + FLOOR]
+    off_centre = 0.1 * np.linalg.norm(spots[:, :2] - middle[:2], axis=1)
+    options: list[tuple[float, Place]] = []  # room about the thing [m], and its place, for every turn
     for turn in _turns(points):
         form = _Form(points, origin, turn)
-        gaps, roofs = form.room(spots, rest)
-        costs = away + 2 * np.maximum(0, MARGIN - gaps) + ROOFED * roofs
+        gaps, roofs = form.room(spots, obstacles)
+        costs = off_centre + 2 * np.maximum(0, MARGIN - gaps) + ROOFED * roofs
         hands = spots + rotation_z(turn) @ (at.hand - origin)  # where the hand is then, if it holds the thing
         if held:
             costs += STAY * np.minimum(np.linalg.norm(spots[:, :2] - origin[:2], axis=1), REACHED)
-            costs += _hindrance(hands, at.yaw + turn, rest) + far(at, hands)
-        one = int(np.argmin(costs))
-        out = form.out(spots[one], rest, OBLIQUE) if roofs[one] else None
-        if roofs[one] and out is None and not roofs.all():  # nothing can come in there
-            one = int(np.argmin(np.where(roofs > 0, np.inf, costs)))
+            costs += _hindrance(hands, at.yaw + turn, obstacles) + far(at, hands)
+        best = int(np.argmin(costs))
+        out = form.out(spots[best], obstacles, OBLIQUE) if roofs[best] else None
+        if roofs[best] and out is None and not roofs.all():  # nothing can come in there
+            best = int(np.argmin(np.where(roofs > 0, np.inf, costs)))
         elif held and out is not None:  # the hand must also have room where it comes down
-            other = int(np.argmin(costs + _hindrance(hands + out, at.yaw + turn, rest)))
-            way = form.out(spots[other], rest, OBLIQUE) if roofs[other] else None
-            if way is not None or not roofs[other]:
-                one, out = other, way
-        slack = float(np.clip(gaps[one], TIGHT, LOOSE)) if out is None else SLIT
-        options.append((float(gaps[one]), Place(spots[one], turn, slack, out)))
-        if gaps[one] > 0:
+            other = int(np.argmin(costs + _hindrance(hands + out, at.yaw + turn, obstacles)))
+            other_out = form.out(spots[other], obstacles, OBLIQUE) if roofs[other] else None
+            if other_out is not None or not roofs[other]:
+                best, out = other, other_out
+        slack = float(np.clip(gaps[best], TIGHT, LOOSE)) if out is None else SLIT
+        options.append((float(gaps[best]), Place(spots[best], turn, slack, out)))
+        if gaps[best] > 0:
             return options[-1][1]
-    best = max(options, key=lambda option: option[0])
-    if best[0] > options[0][0] + MARGIN or extent[2] < THICK:
-        return best[1]
-    return replace(options[0][1], slack=LOOSE)  # it fits nowhere, so it lies on what is there
+    (unturned_room, unturned), (room, place) = options[0], max(options, key=lambda option: option[0])
+    if room > unturned_room + MARGIN or extent[2] < THICK:
+        return place
+    return replace(unturned, slack=LOOSE)  # it fits nowhere, so it lies on what is there
 
 
 def _hindrance(hands: Array, yaw: float, rest: Array) -> Array:

@@ -47,18 +47,21 @@ def approach(at: Situation, grasp: Grasp, points: Array, thing: str, opening: fl
     loose = 1.0 if at.opening > 0.5 else 1.6  # fingers that have begun to close go on unless the hand is far off
     if away < loose * NEAR and turn < loose * TURNED and abs(height) < loose * LEVEL:
         return command(at, grasp.position, grasp.yaw, 1.0, grasp.lean)
-    own = points[:, 2].max() + TIP + MARGIN  # height at which the fingers are above the thing
+    others = at.others(thing, grasp.position, HAND)
+    # Heights of the hand at which its fingers are above the thing, and above what stands about.
+    thing_top, others_top = (each[:, 2].max(initial=-np.inf) + TIP + MARGIN for each in (points, others))
     here = Grasp(grasp.position + offset, at.yaw, grasp.lean)
-    aligned = (NEAR if at.hand[2] > own - 0.01 else 1.6 * NEAR) - away
+    aligned = (NEAR if at.hand[2] > thing_top - 0.01 else 1.6 * NEAR) - away
     turned = TURNED_ROOM * (1.6 * TURNED - turn)
     # How far [m] the hand is from where it may not come down, past what stands about and past the thing itself.
-    beside = min(max(room_of(at, thing, here) - TOUCHING, aligned), ROOM - away, turned)
-    past = min(max(gap_of(here, points), aligned), beside)
-    if opening < 0 and at.opening < 0.5:
-        past = -ROOM
-    over = at.others(thing, grasp.position, HAND)[:, 2].max(initial=-np.inf) + TIP + MARGIN
-    heights = [lowest(at, own + _funnel(away - NEAR), past), lowest(at, over + _funnel(-beside), beside)]
-    target = grasp.position + max(0.0, *(height - grasp.position[2] for height in heights)) * slope
+    others_room = min(max(room_of(at, thing, here) - TOUCHING, aligned), ROOM - away, turned)
+    thing_room = min(max(gap_of(here, points), aligned), others_room)
+    if opening < 0 and at.opening < 0.5:  # fingers that are still closed would come down on the thing
+        thing_room = -ROOM
+    over_thing = lowest(at, thing_top + _funnel(away - NEAR), thing_room)
+    over_others = lowest(at, others_top + _funnel(-others_room), others_room)
+    rise = max(0.0, over_thing - grasp.position[2], over_others - grasp.position[2])
+    target = grasp.position + rise * slope
     return command(at, rising(at, target), grasp.yaw, opening, grasp.lean)
 
 
@@ -80,27 +83,27 @@ def carry(at: Situation, thing: str, place: Place) -> Array:
     origin, yaw, lean = at.origin(thing), at.yaw + place.turn, LEAN * round(at.lean / LEAN)
     if place.hidden is not None:
         return command(at, at.hand + place.hidden + 0.01 * UP, yaw, 1.0, lean)
-    if place.out is not None:
+    if place.out is not None:  # a roof is over the place: first to where it ends, then straight in
         way = place.out / np.linalg.norm(place.out)
         offset = origin - place.spot
-        before = float(offset @ way)
-        aside = float(np.linalg.norm(offset - before * way))
-        if aside > 0.02 or before > np.linalg.norm(place.out) + 0.03:
+        depth = float(offset @ way)  # that the thing still has to go in
+        aside = float(np.linalg.norm(offset - depth * way))
+        if aside > 0.02 or depth > np.linalg.norm(place.out) + 0.03:
             place = Place(place.spot + place.out, place.turn, 0.0)
-        elif before > 0.004:
+        elif depth > 0.004:
             return command(at, at.hand + place.spot - origin, yaw, 1.0, lean)
     offset = place.spot - origin
     away = float(np.hypot(*offset[:2]))
-    lies = offset[2] > -RESTS and place.slack == LOOSE and at.rests(thing)
-    close = away < (0.03 if lies else min(0.015, place.slack))
-    if close and lies and abs(place.turn) < TURNED:
-        return command(at, at.hand, yaw, -1.0, lean)
-    if close and offset[2] > -0.012 and abs(place.turn) < TURNED:
-        return let_go(at, thing)
+    rests = offset[2] > -RESTS and place.slack == LOOSE and at.rests(thing)
+    if away < (0.03 if rests else min(0.015, place.slack)) and abs(place.turn) < TURNED:
+        if rests:
+            return command(at, at.hand, yaw, -1.0, lean)
+        if offset[2] > -0.012:
+            return let_go(at, thing)
     away += 0.1 * abs(place.turn)
     target = at.hand + offset + np.clip(FUNNEL * (away - 0.6 * place.slack), 0.0, CARRY) * UP
-    over = target[2] + max(0.0, _above(at, thing, place.spot))
-    target[2] = max(target[2], lowest(at, over, max(place.slack, 0.015) - away))
+    clear = target[2] + max(0.0, _above(at, thing, place.spot))  # height over all that is on the way
+    target[2] = max(target[2], lowest(at, clear, max(place.slack, 0.015) - away))
     return command(at, rising(at, target), yaw, 1.0, lean)
 
 

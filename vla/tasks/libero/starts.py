@@ -78,8 +78,7 @@ class Starts:
 
         Things on a table are drawn in the ranges of their regions, others, and openings, within what the official
         states span; heights and tilts are those of the official states, which are alike in them. `exchanged`: two pairs
-        of things on tables, or one of three, exchange their regions first, unless the sentence or the goal would no
-        longer hold.
+        of things on tables, or one of three, exchange their regions first where sentence and goal stay true.
         """
         start = self._draw(random, exchanged)
         for _ in range(DRAWS):
@@ -93,11 +92,12 @@ class Starts:
         kind, goal = thing.rpartition("_")[0], set(self._task.goal)
         twins = [name for name in self._owners if name != thing and name.rpartition("_")[0] == kind]
         for twin in twins:  # of a different role, so that the sentence tells them apart by their places
-            other = {thing: twin, twin: thing}
-            if {tuple(other.get(name, name) for name in part) for part in goal} != goal:
+            exchange = {thing: twin, twin: thing}
+            if {tuple(exchange.get(name, name) for name in part) for part in goal} != goal:
                 return False
-        beside = {word for part in goal for name in part if self._on_table(name) for word in name.split("_")}
-        return self._on_table(self._owners[thing]) and not beside & set(kind.split("_"))
+        regions = {name for part in goal for name in part if self._on_table(name)}
+        named = {word for region in regions for word in region.split("_")}  # such as "plate" of a place beside one
+        return self._on_table(self._owners[thing]) and named.isdisjoint(kind.split("_"))
 
     def _on_table(self, region: str) -> bool:
         return bool(self._task.regions.get(region, {}).get("ranges"))

@@ -38,8 +38,7 @@ class MetaWorld(ManyTasks):
     """Fifty tasks of a Sawyer arm, one of them per episode: the seed determines which, in turn.
 
     Success is the first step that Meta-World calls one; an episode ends with it, or when its steps are used up. The
-    state is the hand's position and the opening of the gripper, 0…1. The truth, where object and goal are, is for
-    training and for the expert only.
+    state is the hand's position and the opening of the gripper, 0…1; the truth is where object and goal are.
     """
 
     def __init__(

@@ -54,8 +54,7 @@ class TaskScene:
         self._renderer = LazyRenderer(renderer, self.model, self._views)
 
     def reset(self, seed: int) -> Array:
-        """Draw object and goal, and return the observation (39,): hand, gripper, objects, the same one step before,
-        goal."""
+        """Draw object and goal; return the observation (39,): hand, gripper, objects, the same a step before, goal."""
         self.simulator.seed(seed)
         observation, _ = self.simulator.reset()
         stop_sliding(self.simulator)

@@ -1,7 +1,6 @@
 """The GL context of this process, which all fast renderers share.
 
-Drivers compile shaders and the filters of textures anew in every context, which takes most of the time that it takes to
-open a renderer.
+Drivers compile shaders and texture filters anew in every context: most of the time that opening a renderer takes.
 """
 
 from __future__ import annotations

@@ -23,8 +23,7 @@ Span = tuple[int, int]  # first index of triangles, and number of indices
 class Shadows:
     """Shadow maps of the lamps of a model.
 
-    What stands still is drawn again only when it or a lamp has been moved. Every frame copies its map, and adds the
-    rest.
+    What stands still is drawn again only when it or a lamp was moved. Every frame copies its map and adds the rest.
 
     Attributes:
         maps: depth texture of each lamp.

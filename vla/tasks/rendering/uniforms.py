@@ -1,5 +1,4 @@
-"""What the shaders of pictures read for every camera: projections, and lights as MuJoCo's fixed-function lighting has
-them."""
+"""What the shaders of pictures read for a camera: projections, and lights as in MuJoCo's fixed-function lighting."""
 
 from __future__ import annotations
 

@@ -142,8 +142,7 @@ class Tabletop(World):
         return self.look()
 
     def drive(self, joints: Array, opening: float, seconds: float) -> None:
-        """Move towards joint targets (J,) [rad] and a gripper opening 0…1 for `seconds`; call `judge` once per control
-        period.
+        """Move towards joints (J,) [rad] and a gripper opening 0…1 for `seconds`; call `judge` once per control period.
 
         Raises:
             UserError: `seconds` is no whole number of physics steps.

@@ -1,7 +1,6 @@
 """A robot arm with a gripper in MJCF or URDF, as a configuration describes it.
 
-The files are data, which MuJoCo compiles. Names that they lack, files that are missing and models that do not compile
-end in one sentence.
+The files are data, which MuJoCo compiles. Missing names and files, and models that do not compile, are UserErrors.
 """
 
 from __future__ import annotations

@@ -93,18 +93,21 @@ def _drop_couplings(spec: mujoco.MjSpec, model: mujoco.MjModel, fixed: Collectio
         part[body] = body if body in moved else part[model.body_parentid[body]]
     slack: set[str] = set()
     for tendon in [*spec.tendons]:
-        over = [wrap.target for wrap in tendon.path if wrap.target is not None]
-        of_joints = isinstance(over[0], mujoco.MjsJoint)
-        if any(each.name in fixed for each in over) if of_joints else len({part[each.parent.id] for each in over}) < 2:
+        targets = [wrap.target for wrap in tendon.path if wrap.target is not None]  # all joints, or all sites or geoms
+        if isinstance(targets[0], mujoco.MjsJoint):
+            useless = any(joint.name in fixed for joint in targets)
+        else:
+            useless = len({part[target.parent.id] for target in targets}) < 2
+        if useless:
             slack.add(tendon.name)
             spec.delete(tendon)
-    gone = {Eq.mjEQ_JOINT: fixed, Eq.mjEQ_TENDON: slack}
+    deleted = {Eq.mjEQ_JOINT: fixed, Eq.mjEQ_TENDON: slack}
     for tie, *ends in zip([*spec.equalities], model.eq_obj1id, model.eq_obj2id, strict=True):
         if tie.type in (Eq.mjEQ_CONNECT, Eq.mjEQ_WELD):
             bodies = model.site_bodyid[ends] if tie.objtype == mujoco.mjtObj.mjOBJ_SITE else ends
             useless = part[bodies[0]] == part[bodies[1]]
         else:
-            useless = not {tie.name1, tie.name2}.isdisjoint(gone.get(tie.type, ()))
+            useless = not {tie.name1, tie.name2}.isdisjoint(deleted.get(tie.type, ()))
         if useless:
             spec.delete(tie)
     return slack
@@ -249,8 +252,7 @@ def _frame_of(model: mujoco.MjModel, geom: Any) -> tuple[Array, Array]:
 
 
 def add_hull(spec: mujoco.MjSpec, name: str, points: Array) -> bool:
-    """Add the convex hull of a few of the (N, 3) points as mesh `name`; return False, and add nothing, if it is
-    flat."""
+    """Add the convex hull of a few of (N, 3) points as mesh `name`, unless it is flat; return whether it was added."""
     if np.linalg.matrix_rank(points - points.mean(0), tol=1e-3) < 3:
         return False
     # A scale that the file gives to its own meshes by default must not apply.

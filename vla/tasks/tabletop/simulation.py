@@ -306,8 +306,7 @@ class Simulation:
     def truth(self) -> dict[str, Array]:
         """Return the privileged state for experts, by name, of the current subgoal and its block; lengths in [m].
 
-        faces: cosine and sine of four times the yaw from the fingers to the block's faces, because a cube is symmetric
-        under quarter turns.
+        faces: cosine and sine of four times the yaw from the fingers to the block's faces, alike after a quarter turn.
         """
         compiled, state, pose = self.compiled, self.world_state(), self.controller.pose
         now = current(self.goal.subgoals(state, self.referents))

@@ -26,8 +26,7 @@ class Mixed:
     """
 
     def __init__(self, goals: Mapping[str, Goal | None], impossible: Share, silent: Share) -> None:
-        """Take name → goal, or None to omit it, and shares of the episodes with an absent block and with an empty
-        instruction.
+        """Take name → goal, None to omit it, and the shares of episodes with an absent block and with no instruction.
 
         Raises:
             UserError: no goal remains, or the shares exceed one.
@@ -52,9 +51,8 @@ class Mixed:
 class Chain:
     """Several instructions in a row, each of which is given when the one before is completed.
 
-    They are drawn at the start of the episode, so that they do not depend on who acts. Each is feasible once the
-    earlier ones are carried out: no block is put where another one is or is taken from below another one, and what
-    was lifted is what comes next.
+    They are drawn at the start of the episode, whoever acts. Each is feasible once the earlier ones are carried out: no
+    block is put where another one is or is taken from below another one, and what was lifted comes next.
 
     Attributes:
         blocks: minimum number of blocks on the table.

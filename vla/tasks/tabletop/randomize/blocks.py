@@ -133,8 +133,7 @@ class Placement:
     clearance: NonNegative  # minimum gap between outlines [m]
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
-        """Draw a place for every pad and block in turn, also for those that will be absent (UserError: the rectangle is
-        too small)."""
+        """Draw a place for every pad and block in turn, also absent ones (UserError: the rectangle is too small)."""
         count = len(scene.block_geoms)
         # Equal room for every block, so that this draw is independent of sizes, shapes and distractors.
         radii = [PAD_RADIUS, *[ROOM] * count, *[PAD_RADIUS] * (len(PADS) - 1)]
