@@ -34,8 +34,13 @@ epoch,step,lr,train/loss,train/truth_loss,val/error_dx_mm,val/error_dy_mm,val/er
 """
 
 
-def a_report(*outcomes: str) -> Report:
-    return Report(tuple(Result(FIRST_SEED + n, outcome, SAID, 20, {"n": n}) for n, outcome in enumerate(outcomes)))
+OUTCOMES = {"1": "success", "s": "success", "0": "dropped", "d": "dropped", "t": "timeout", "e": "error"}
+
+
+def a_report(outcomes: str, anytime: bool = False) -> Report:
+    """An episode for every letter: 1 or s is a success, 0 or d a drop, t a timeout, e an error."""
+    results = (Result(FIRST_SEED + n, OUTCOMES[each], SAID, 20, {"n": n}) for n, each in enumerate(outcomes))
+    return Report(tuple(results), anytime=anytime)
 
 
 def a_run(
@@ -49,14 +54,10 @@ def a_run(
 ) -> Path:
     """A folder as an evaluation leaves it, without pictures and recordings.
 
-    s is a success, d a drop, t a timeout, e an error; in the dark all are drops unless told. The report has `more`
-    entries.
+    In the dark all are drops unless told. The report has `more` entries.
     """
     folder.mkdir(parents=True)
-    report, in_the_dark = (
-        a_report(*({"s": "success", "d": "dropped", "t": "timeout", "e": "error"}[outcome] for outcome in all_of_them))
-        for all_of_them in (outcomes, dark or "d" * len(outcomes))
-    )
+    report, in_the_dark = map(a_report, (outcomes, dark or "d" * len(outcomes)))
     if light is not None:
         report = Report(tuple(replace(result, draws={**result.draws, "light": light}) for result in report.results))
     told = {"evaluate": {"conditions": {"dark": {"light": light}}}}

@@ -9,12 +9,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from composing import composed
+from composing import composed, run_job
 from saved_policies import save_policy
 from toy import SPEC
 
+from vla.config.adopt import adopt, finetune
 from vla.config.build import build
-from vla.config.experiment import plain
+from vla.config.experiment import make_policy, plain
 
 HANDLER = "torch.distributed.elastic.multiprocessing.subprocess_handler.subprocess_handler.SubprocessHandler"
 
@@ -117,6 +118,22 @@ def save(folder: Path, config: Any) -> Path:
     """Write a policy without weights of the world that its configuration describes."""
     known = config["task"] == recorded()
     return save_policy(folder, config, build(config["task"], "task").spec if known else SPEC)
+
+
+def ways(policy: Path, *own: str) -> dict[str, Callable[[], object]]:
+    """How somebody else's policy is used, with overrides of one's own."""
+
+    def adopted(*options: str) -> Callable[[], None]:
+        return lambda: run_job(adopt(composed(*own, f"checkpoint={policy}", *options), []))
+
+    def tuned(job: str) -> Callable[[], None]:
+        return lambda: run_job(finetune(composed(*own, f"pretrained={policy}", f"job={job}"), []))
+
+    return {
+        "policy": lambda: make_policy(plain(composed().policy), policy),  # as programs do
+        **{"evaluate": adopted(), "deploy": adopted("job=deploy", "deploy=ros2")},
+        **{"pretrained": tuned("train"), "improve": tuned("improve")},
+    }
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import lightning
@@ -12,6 +13,7 @@ from toy import SPEC
 
 from vla.models.learner import Learner
 from vla.models.model import Model
+from vla.training.checkpoints import AtomicCheckpointIO
 
 MODEL = {"_target_": "vla.models.bc.BC", "shift": [0, 0]}
 
@@ -40,6 +42,13 @@ def make_trainer(steps: int, *callbacks: lightning.Callback, precision: Any = "3
 def loader(learner: Learner, batches: list[dict[str, Any]]) -> DataLoader[Any]:
     """Loader of batches, with their sentences as tokens."""
     return DataLoader([with_text(learner.model, batch) for batch in batches], batch_size=None)  # type: ignore[arg-type]
+
+
+def save(trainer: lightning.Trainer, folder: Path, *names: str) -> None:
+    """Save checkpoints, whose names end in .ckpt, and policies."""
+    trainer.strategy.checkpoint_io = AtomicCheckpointIO()
+    for name in names:
+        trainer.save_checkpoint(folder / name, weights_only=False)
 
 
 def fit(learner: Learner, batch: dict[str, Any], steps: int, **options: Any) -> lightning.Trainer:

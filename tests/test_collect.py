@@ -233,7 +233,15 @@ def test_an_expert_that_does_not_look_leaves_the_same_demonstrations_from_fewer_
     assert counts == [1 + steps + 1 + 1, steps + 1 + 41]  # every reset draws one image
 
 
-@pytest.mark.parametrize("world", [("task/randomize=wide",), ("task=metaworld", "task.tasks=[push]")], ids=" ".join)
+@pytest.mark.parametrize(
+    "world",
+    [
+        ("task/randomize=wide",),
+        ("task=metaworld", "task.tasks=[push]"),
+        ("task=libero", "task.suite=goal", "task.tasks=[7]", "task.detail.robot=300"),
+    ],
+    ids=" ".join,
+)
 def test_images_drawn_in_the_replay_are_those_of_the_rollout(world: tuple[str, ...]) -> None:
     experiment = Experiment.of(composed(*world, "task.image_size=[48,64]"))
     worker = DemonstrationWorker(experiment.make_environment(), experiment.make_expert())

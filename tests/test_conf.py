@@ -77,11 +77,6 @@ def brought_by(group: str) -> list[str]:
     return next(overrides for overrides in ([], *parents) if group in groups(*overrides))
 
 
-def test_deploying_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="job=deploy needs deploy"):
-        check(composed("job=deploy"))
-
-
 @pytest.mark.parametrize(("group", "option"), OPTIONS, ids=[f"{group}={option}" for group, option in OPTIONS])
 def test_option(group: str, option: str) -> None:
     top = group.partition("/")[0]
@@ -137,18 +132,18 @@ def test_a_variant_that_cannot_be_is_refused(overrides: tuple[str, ...], sentenc
         compose_whole("output=there", *overrides)
 
 
-@pytest.mark.parametrize(
-    ("goal", "values"),
-    [
-        ("pick_place", {"radius": 0.04}),
-        ("lift", {"height": 0.1}),
-        ("push", {"radius": 0.04, "highest": 0.02}),
-        ("stack", {}),
-    ],
-)
-def test_success_is_what_the_documentation_says(goal: str, values: dict[str, float]) -> None:
-    asked = composed(f"task/goal={goal}").task.goal
-    assert {name: asked[name] for name in values} == values and asked.hold_steps == 3
+def test_success_is_what_the_documentation_says() -> None:
+    page = " ".join((CONF.parent / "docs/worlds.md").read_text(encoding="utf-8").split())
+    place, lift, push = (composed(f"task/goal={goal}").task.goal for goal in ("pick_place", "lift", "push"))
+    assert {goal.hold_steps for goal in (place, lift, push, composed("task/goal=stack").task.goal)} == {3}
+    for said in (
+        "must hold in three consecutive steps",
+        f"its centre less than {100 * place.radius:g} cm from that of the pad",
+        f"more than {100 * lift.height:g} cm above where it started",
+        f"rests less than {100 * push.radius:g} cm from the pad, and was never lifted by {100 * push.highest:g} cm",
+        "the arm rests for fifteen steps",
+    ):
+        assert said in page, said
     assert REST_STEPS == 15
 
 
@@ -194,11 +189,8 @@ def test_the_suite_has_every_axis_by_itself_at_each_level() -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_every_model_says_by_how_much_it_shifts_images(model: str) -> None:
-    published = {"rt1": [20, 50], **{vlm: [0, 0] for vlm in ("smolvla", "pi0", "pi05")}}
-    assert composed(f"model={model}").model.shift == published.get(model, [12, 12])
-    assert composed("experiment=rt1").model.shift == [20, 50]
-    for experiment in ("standard", "few", "multitask"):  # of any model
+def test_an_experiment_shifts_the_images_of_any_model(model: str) -> None:
+    for experiment in ("standard", "few", "multitask"):
         assert composed(f"experiment={experiment}", f"model={model}").model.shift == [4, 4]
 
 

@@ -8,10 +8,9 @@ from typing import Any
 import torch
 from fake_batch import make_batch
 from lightning import Callback
-from small_training import loader, make_learner, make_trainer
+from small_training import loader, make_learner, make_trainer, save
 
 from vla.models.policy_folder import read_policy
-from vla.training.checkpoints import AtomicCheckpointIO
 from vla.training.ema import EMA, EVERY
 
 DECAY = 0.9
@@ -36,9 +35,7 @@ def test_it_is_the_exponential_average_of_the_steps_and_what_is_validated_and_sa
     trainer = make_trainer(steps, EMA(DECAY), watch)
     learner = make_learner(lr=1e-2, warmup_steps=0)
     trainer.fit(learner, loader(learner, [batch] * steps), loader(learner, [batch]))
-    trainer.strategy.checkpoint_io = AtomicCheckpointIO()
-    for name in ("last.ckpt", "policy"):
-        trainer.save_checkpoint(tmp_path / name, weights_only=False)
+    save(trainer, tmp_path, "last.ckpt", "policy")
     weights = [DECAY ** (steps - step) for step in range(EVERY, steps + 1, EVERY)]
     seen = torch.stack(watch.trained[EVERY - 1 :: EVERY])
     average = torch.einsum("n,n...->...", torch.tensor(weights) / sum(weights), seen)  # of the initial weights nothing

@@ -177,15 +177,10 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
 
     with pytest.raises(ValueError, match=r"depth_wrist\.bin is shorter than its index says"):
         EpisodeStore(damaged("depth_wrist.bin", lambda data: data[:-1]))
-    with pytest.raises(ValueError, match=r"line 2 of .*index\.jsonl is damaged: it does not fit its checksum: keep"):
-        EpisodeStore(damaged("index.jsonl", lambda data: data.replace(b'{"seed": 1,', b"#", 1)))
     with pytest.raises(ValueError, match=r"line 2 of .*index\.jsonl does not follow"):
         EpisodeStore(damaged("index.jsonl", lambda data: data.split(b"\n")[0] + b"\n" + data))
-    store = EpisodeStore(damaged("action.bin", lambda data: bytes([data[0] ^ 1]) + data[1:]))
-    with pytest.raises(ValueError, match=r"the rows of seed 0 in .* were changed on disk"):
-        store.read(store.episodes[0])
     with pytest.raises(ValueError, match="has no field 'rgb'"):
-        store.rows("rgb")
+        EpisodeStore(whole).rows("rgb")
 
 
 @pytest.mark.parametrize("name", ["index.jsonl", "executed.bin", "rgb_front.bin"])

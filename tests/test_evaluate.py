@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import toy_recordable as toy
 from composing import composed
+from finished_runs import a_report
 from rerun.chunk import RrdReader
 
 from vla.config.experiment import Experiment
@@ -28,12 +29,8 @@ from vla.spec import FIRST_SEED, Array, Environment, Observation
 SEEDS = range(FIRST_SEED, FIRST_SEED + 10)
 
 
-def results(*outcomes: str) -> Report:
-    return Report(tuple(Result(FIRST_SEED + index, outcome) for index, outcome in enumerate(outcomes)))
-
-
 def test_the_last_line_is_the_success_rate() -> None:
-    report = results(*["success"] * 83, *["dropped"] * 17)
+    report = a_report("s" * 83 + "d" * 17)
     assert str(report).splitlines() == ["dropped 17", "success 83/100 (83.0 %, 95 % CI 74.5-89.1)"]
 
 
@@ -130,14 +127,15 @@ def test_milestones_have_a_rate_of_their_own() -> None:
 
 
 def test_errors_are_neither_successes_nor_failures() -> None:
-    report = results("success", "error", "dropped", "dropped", "error")
+    report = a_report("sedde")
     assert (report.episodes, report.successes, len(report.errors)) == (3, 1, 2)
     assert report.success == 1 / 3
     assert report.outcome_counts == {"error": 2, "dropped": 2, "success": 1}
 
 
 def test_a_report_of_errors_alone_has_the_widest_interval() -> None:
-    assert str(results("error")).splitlines()[-1] == "success 0/0 (no episode was completed)"
+    assert str(a_report("e")).splitlines()[-1] == "success 0/0 (no episode was completed)"
+    assert a_report("e").interval == (0, 1)
 
 
 def test_two_workers_report_what_one_reports() -> None:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
-from composing import composed, run_job
-from hostile import hidden, hiding, listener, save
+from composing import composed
+from hostile import hidden, hiding, listener, save, ways
 from saved_policies import save_run
 
-from vla.config.adopt import adopt, finetune
-from vla.config.experiment import make_policy, plain
+from vla.config.experiment import plain
 from vla.models.checkpoint import read_header
 from vla.runs.resume import training_progress
 
 ATTACKS = list(hiding(plain(composed("expert=waypoint")), Path(), 0))
 SECRET = "hunter2secret"
+HIDDEN = {"python": r"_target_ must name a class", "secret": "holds the reference"}  # what is said of it
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
@@ -29,19 +27,9 @@ def test_nothing_that_is_hidden_acts(attack: str, tmp_path: Path, monkeypatch: p
         config = hiding(plain(composed("expert=waypoint", "trainer=cpu")), mark, port)[attack]
         path = save(tmp_path / "theirs", config)
         small = ("output=mine", "cluster.workers=1", "evaluate.episodes=1", "recorder=none")
-
-        def adopted(*options: str) -> Callable[[], None]:
-            return lambda: run_job(adopt(composed(*small, f"checkpoint={path}", *options), []))
-
-        ways: dict[str, Callable[[], Any]] = {
-            "policy": lambda: make_policy(plain(composed().policy), path),  # as programs do
-            "evaluate": adopted(),
-            "deploy": adopted("job=deploy", "deploy=ros2"),
-            "pretrained": lambda: run_job(finetune(composed(*small, f"pretrained={path}", "job=train"), [])),
-            "improve": lambda: run_job(finetune(composed(*small, f"pretrained={path}", "job=improve"), [])),
-        }
-        for way, do in ways.items():
-            with pytest.raises(ValueError):
+        for way, do in ways(path, *small).items():
+            says = next((said for word, said in HIDDEN.items() if word in attack), None)
+            with pytest.raises(ValueError, match=says or ("in expert" if way == "improve" else None)):
                 do()
             assert not mark.exists() and not connected(), way
     written = [file for file in (tmp_path / "mine").rglob("*") if file.is_file()]

@@ -63,12 +63,6 @@ def test_film_conv_wants_lists_of_one_length() -> None:
         FilmConv([4, 6], [5], [2, 2], text_width=8, chroma=True, positions=False)
 
 
-def test_81_positions_become_8_tokens() -> None:
-    learner = TokenLearner(512, 8)
-    assert learner(torch.randn(2, 512, 9, 9)).shape == (2, 8, 512)
-    assert sum(p.numel() for p in learner.parameters()) == 2 * 512 + 512 * 64 + 64 + 64 * 8 + 8  # 34 k
-
-
 def test_tokens_first_attend_to_a_few_positions() -> None:
     torch.manual_seed(0)
     learner = TokenLearner(32, 8)

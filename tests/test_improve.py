@@ -29,7 +29,6 @@ from vla.rollouts.collect import collect
 from vla.rollouts.rollout import replay, rollout
 from vla.rollouts.supervised import Supervised, make_supervised, require_memoryless
 from vla.runs.folder import save_config
-from vla.tasks.metaworld.expert import Scripted
 from vla.tasks.perturb import Perturbed
 from vla.tasks.tabletop.expert import Waypoint
 
@@ -98,9 +97,6 @@ def test_windows_of_several_stores_are_those_of_each(labelled: EpisodeStore, fol
 
 
 def test_only_a_memoryless_expert_labels() -> None:
-    for expert in (Waypoint, Scripted):
-        assert expert.memoryless
-
     class Counting(toy.ToyExpert):
         memoryless = False
 

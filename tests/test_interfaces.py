@@ -173,6 +173,7 @@ class TestDmEnv(test_utils.EnvironmentTestMixin, absltest.TestCase):
         assert [other.reset().observation["state"].tobytes() for _ in range(3)] == states
 
 
-@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", WORLDS.read_text(encoding="utf-8"), re.DOTALL))
-def test_the_page_runs(code: str) -> None:
-    exec(code, {})
+def test_the_page_runs() -> None:
+    first, second = re.findall(r"```python\n(.*?)```", WORLDS.read_text(encoding="utf-8"), re.DOTALL)
+    exec(first, {})
+    exec(second, {})

@@ -23,12 +23,12 @@ from vla.tasks.libero import package, scene
 from vla.tasks.libero.controller import Controller
 from vla.tasks.libero.environment import Libero
 from vla.tasks.libero.expert import Planner
-from vla.tasks.libero.goal import Goal
+from vla.tasks.libero.goal import CABINET, Goal
 from vla.tasks.libero.grasps import choose_grasp
 from vla.tasks.libero.package import SUITES, tasks_of
 from vla.tasks.libero.places import place_of
 from vla.tasks.libero.situation import Situation
-from vla.tasks.libero.skills import approach
+from vla.tasks.libero.skills import approach, carry
 from vla.tasks.libero.starts import Starts, set_start
 
 REFERENCE = Path(__file__).with_name("libero_reference.npz")  # of robosuite, by tools/libero/excerpt.py
@@ -225,6 +225,36 @@ def test_no_millimetre_decides_whether_the_hand_goes_up_or_down() -> None:
     steps = np.abs(np.diff(lines, axis=1))
     assert np.ptp(lines) == 2  # from full speed down to full speed up
     assert steps.max() < 1.2
+
+
+def test_a_drawer_that_slips_shut_by_two_millimetres_costs_no_grip_and_one_that_closes_does() -> None:
+    with closing(world("task.suite=goal", "task.tasks=[3]")) as environment, environment.blind():
+        expert, seen, at = Planner(spec=environment.spec), environment.reset(1), Situation(environment._task)
+        (_, bowl, drawer), heights, truth = at.goal.parts[0], list[float](), dict[str, Array]()
+        while not heights or heights[-1] < heights[0] + 0.03:  # once the drawer is open
+            seen = environment.step(expert.act(seen))
+            truth = seen.truth or {}
+            at.take(truth)
+            heights.append(float(at.origin(bowl)[2]))
+        joint, grips = at.model.jnt_qposadr[at.goal.joints(drawer)], list[float]()
+        for opening in (CABINET[0] + 0.002, CABINET[0] + 0.04):
+            truth["positions"][joint] = opening
+            grips.append(expert.act(seen)[6])
+        assert grips == [-1.0, 1.0]
+
+
+def test_nothing_is_lowered_through_a_roof() -> None:
+    with closing(world("task.suite=long", "task.tasks=[9]")) as environment, environment.blind():
+        seen, at = environment.reset(1), Situation(environment._task)
+        assert seen.truth is not None
+        at.take(seen.truth)
+        _, mug, inside = at.goal.parts[0]
+        spot, free = place_of(at, mug, inside, True).spot, at.model.body_jntadr[at.goal.bodies[mug]]
+        for height in (0.1, 0.15):  # over its place in the microwave
+            seen.truth["positions"][at.model.jnt_qposadr[free] + np.arange(3)] = spot + np.array([0, 0, height])
+            at.take(seen.truth)
+            command = carry(at, mug, place_of(at, mug, inside, True))
+            assert command[1] < -0.1 and command[2] > 0 and command[6] > 0  # towards the door, and not down
 
 
 def test_the_planner_goes_on_from_where_another_agent_led() -> None:

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import here
 from composing import check, composed
+from lerobot_files import info
 from PIL import Image, ImageOps
 from test_libero import PLAIN, solved, world
 from websockets.sync.server import ServerConnection, serve
@@ -82,14 +83,6 @@ def test_libero_pro_is_an_evaluation_with_a_paired_difference_per_change(tmp_pat
     report = json.loads((tmp_path / "pro/report.json").read_text())
     assert [report["conditions"][name]["success"] for name in ("positions", "sentences")] == [1.0, 1.0]
     assert {suite: part["of"] for suite, part in report["tiers"].items()} == {"object": 1}
-
-
-def test_memory_is_measured_on_libero(tmp_path: Path) -> None:
-    here(tmp_path, "job=collect", *ONE, *QUIET, *CLEAN, "collect.episodes=2", "collect.folder=store")
-    asked = ["evaluate=memory", "evaluate.nearest=store", "evaluate.episodes=1", "output=memory", "agent=expert"]
-    here(tmp_path, *ONE, *QUIET, *CLEAN, *asked, "evaluate.recordings=0")
-    report = json.loads((tmp_path / "memory/report.json").read_text())
-    assert report["conditions"].keys() >= {"without_images", "without_instruction", "nearest"}
 
 
 @contextmanager
@@ -199,9 +192,7 @@ def test_human_demonstrations_become_episodes_of_this_world(tmp_path: Path) -> N
 def test_a_dataset_of_something_else_ends_in_a_sentence(tmp_path: Path) -> None:
     empty = [np.zeros(7, np.float32)] * 6
     folder = published(tmp_path / "libero", empty, [np.zeros(7, np.float32)] * 6, Image.new("RGB", (256, 256)))
-    info = json.loads((folder / "meta/info.json").read_text())
-    info["features"]["observation.state"] |= {"shape": [7], "names": None}
-    (folder / "meta/info.json").write_text(json.dumps(info))
+    info(lambda content: content["features"]["observation.state"].update(shape=[7], names=None))(folder)
     config = Experiment.of(composed(*PLAIN, "expert=lerobot_libero", f"expert.folder={folder}"))
     with closing(world()) as environment, pytest.raises(UserError, match=r"state of 7 numbers .* the task has 8"):
         build(config["expert"], "expert", spec=environment.spec)

@@ -12,7 +12,7 @@ import torch
 from defaults import defaults_of
 from fake_batch import make_act, make_batch, make_bc, make_decoder, with_text
 from safetensors.torch import load_file, save_file
-from small_training import loader, make_learner, make_trainer
+from small_training import loader, make_learner, make_trainer, save
 from together import composed, train
 
 from vla.data.episodes import EpisodeStore
@@ -23,7 +23,6 @@ from vla.models.model import Model
 from vla.models.policy_folder import WEIGHTS, read_policy
 from vla.models.vision.timm_encoders import FilmBackbone
 from vla.runs.folder import LAST
-from vla.training.checkpoints import AtomicCheckpointIO
 from vla.training.ema import EMA
 
 FILE = "trunk.safetensors"
@@ -38,9 +37,7 @@ def trained(model: Model, folder: Path, steps: int = 9, **options: Any) -> Learn
     learner = make_learner(model, lr=1e-2, warmup_steps=0, **options)
     trainer = make_trainer(steps, EMA(0.9))
     trainer.fit(learner, loader(learner, [make_batch(1, model.chunk)] * steps))
-    trainer.strategy.checkpoint_io = AtomicCheckpointIO()
-    trainer.save_checkpoint(folder / "policy", weights_only=False)
-    trainer.save_checkpoint(folder / LAST, weights_only=False)
+    save(trainer, folder, "policy", LAST)
     learner.load_state_dict(torch.load(folder / LAST, weights_only=True)["state_dict"])
     return learner
 

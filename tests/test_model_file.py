@@ -9,8 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from arm_models import arguments_of, chosen, fingers, make, mjcf, successes, urdf
-from command_line import here
+from arm_models import arguments_of, fingers, make, mjcf, successes, urdf
 
 from vla.tasks.tabletop import robot_file
 from vla.tasks.tabletop.file_robot import FileRobot
@@ -132,12 +131,3 @@ def test_the_settings_of_the_tabletop_hold_without_a_warning(
     environment.close()
     assert "conflict" not in "".join(capfd.readouterr())
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
-
-
-def test_the_command_line_shows_no_source_lines(tmp_path: Path) -> None:
-    (tmp_path / "arm.xml").write_text(mjcf(more=SETTINGS + TEXTURED))
-    run = ("job=collect", "collect.episodes=1", "expert=clean", "task.image_size=[16,16]", "cluster.workers=1")
-    done = here(tmp_path, *run, "collect.folder=store", "output=run", *chosen(tmp_path / "arm.xml"))
-    said = done.stdout + done.stderr
-    assert "conflict" not in said and "Warning" not in said and ".py:" not in said
-    assert said.count("its textures are left out") == 1

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from defaults import defaults_of
 from fake_batch import (
     Motions,
     make_act,
@@ -21,15 +20,13 @@ from fake_batch import (
     overfit,
     with_text,
 )
+from test_decoder import MODELS as DECODERS
 from toy import SPEC
 
 from vla.models.diffusion import Diffusion
 from vla.models.flow import Flow
 from vla.models.layers import RunningNormalizer
 from vla.models.model import Model
-from vla.models.tokenizers.fast import Fast
-from vla.models.tokenizers.quantile import Quantile
-from vla.models.tokenizers.tokenizer import RT1Bins
 
 MOTIONS = Motions()
 MODELS: dict[str, Callable[..., Model]] = {
@@ -38,12 +35,7 @@ MODELS: dict[str, Callable[..., Model]] = {
     "rt1": make_rt1,
     "rt1 chunk": partial(make_rt1, chunk=2, proprioception=True),
     "decoder": make_decoder,
-    "decoder chunk": partial(make_decoder, history=3, chunk=3),
-    "decoder rt1": lambda **options: make_decoder(tokenizer=RT1Bins(spec=SPEC, **defaults_of("tokenizer/rt1"))),
-    "decoder quantile": lambda **options: make_decoder(tokenizer=Quantile(bins=64, spec=SPEC, statistics=MOTIONS)),
-    "decoder fast": lambda **options: make_decoder(
-        chunk=4, tokenizer=Fast(bins=256, chunk=4, spec=SPEC, statistics=MOTIONS, scale=10.0), **options
-    ),
+    **{f"decoder {name}": make for name, make in DECODERS.items() if name != "uniform"},
     "act": make_act,
     "diffusion": partial(make_denoising, Diffusion),
     "flow": partial(make_denoising, Flow),
@@ -92,7 +84,7 @@ def test_overfits_one_batch(name: str) -> None:
 @every_model
 def test_saves_and_loads_equal_and_ignores_truth_and_labels(name: str) -> None:
     model, batch = made(name)
-    other, _ = made(name)
+    other = MODELS[name]()  # with other weights
     model.loss(batch)  # gathers statistics, which must travel too
     other.load_state_dict(model.state_dict())
     seen = {name: value for name, value in batch.items() if name not in ("truth", "action", "valid", "instruction")}

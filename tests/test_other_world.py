@@ -30,6 +30,7 @@ from vla.reports.run_page import write_page
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.recorder import RerunRecorder
 from vla.rollouts.recordings import merge_recordings
+from vla.rollouts.rollout import rollout
 from vla.runs.folder import save_config
 from vla.spec import FIRST_SEED
 
@@ -40,9 +41,9 @@ SMALL = (
 OWN = {"expert": "clean", "evaluate": "generalisation"}
 
 
-def policy_of(store: Path, environment: Any = None) -> Policy:
+def policy_of(store: Path, environment: Any = None, overrides: tuple[str, ...] = SMALL) -> Policy:
     """A policy after two steps of training."""
-    experiment, opened = Experiment.of(composed(*SMALL)), EpisodeStore(store)
+    experiment, opened = Experiment.of(composed(*overrides)), EpisodeStore(store)
     learner = experiment.fitted_learner(opened)
     network = learner.model
     data = experiment.data(opened, network.history, network.chunk, network.text.tokenize)
@@ -71,6 +72,14 @@ def test_a_policy_is_evaluated_recorded_and_reported(folder: Path, tmp_path: Pat
     assert "dim" in page and json.loads((cell / "report.json").read_text())["tasks"].keys() == report.tasks.keys()
     tabulate(tmp_path)
     assert (tmp_path / "sweep.html").is_file()
+
+
+@pytest.mark.parametrize("model", ["act", "diffusion", "flow"])
+def test_models_of_actions_that_are_no_tokens_are_trained_and_act(model: str, folder: Path) -> None:
+    few = ("collect.episodes=30", "data.batch_size=4", "data.validation_fraction=0")
+    policy = policy_of(folder, overrides=(f"model={model}", "model.width=32", *few))
+    actions = rollout(toy.make_environment(), policy, FIRST_SEED).actions
+    assert actions.any() and np.isfinite(actions).all()
 
 
 @pytest.mark.parametrize("kind", ["files", "lerobot"])

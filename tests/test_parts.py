@@ -17,7 +17,7 @@ from fake_batch import as_policy, make_batch
 from installed_package import NAME, digest, install, zipped_folder
 from safetensors.torch import save_file
 from saved_policies import change_json
-from small_training import loader, make_trainer
+from small_training import loader, make_trainer, save
 from tiny_encoder import sizes, write_encoder
 
 from vla import jobs
@@ -26,7 +26,6 @@ from vla.config.experiment import Experiment, make_policy
 from vla.io.errors import UserError
 from vla.models.policy_folder import read_policy
 from vla.policy import Policy
-from vla.training.checkpoints import AtomicCheckpointIO
 from vla.training.ema import EMA
 
 if TYPE_CHECKING:
@@ -43,9 +42,7 @@ def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy
     trainer = make_trainer(2, EMA(0.9))
     batch = make_batch(learner.model.history, learner.model.chunk, spec=tabletop.spec)
     trainer.fit(learner, loader(learner, [batch] * 2))
-    trainer.strategy.checkpoint_io = AtomicCheckpointIO()
-    for name in ("last.ckpt", "policy"):
-        trainer.save_checkpoint(tmp_path / name, weights_only=False)
+    save(trainer, tmp_path, "last.ckpt", "policy")
     read_policy(tmp_path / "policy").restore(learner.model)  # the averages
     return as_policy(learner.model, tabletop.spec, device="cpu"), tmp_path / "policy"
 

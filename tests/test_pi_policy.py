@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import pytest
 import torch
 from command_line import SMALL, here
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 from tiny_pi import KINDS, SIZES, SPEC, batch_of, make_network, make_policy, observed, take_statistics, write_tokenizer
 from tiny_vla import REFERENCE, deviation, published, reference
 from torch import Tensor
 
 from vla.config.compose import compose
+from vla.io.errors import UserError
 from vla.models.vlm.network import renamed
 from vla.models.vlm.policy import last_of
 from vla.models.vlm.prompt import PADDING
@@ -83,7 +85,7 @@ def write_published(folder: Path, name: str) -> dict[str, Tensor]:
 
 
 @each
-def test_published_weights_and_statistics_are_loaded(name: str, tmp_path: Path) -> None:
+def test_published_weights_and_statistics_are_loaded_and_a_missing_weight_is_named(name: str, tmp_path: Path) -> None:
     weights = write_published(tmp_path, name)
     text = write_tokenizer(tmp_path)
     model = make_policy(name, text, trunk=str(tmp_path), statistics="pretrained")
@@ -96,6 +98,11 @@ def test_published_weights_and_statistics_are_loaded(name: str, tmp_path: Path) 
         other.state_normalizer.load_state_dict(model.state_normalizer.state_dict())
         other.action_normalizer.load_state_dict(model.action_normalizer.state_dict())
         assert torch.equal(model.predict(batch_of(model)).actions, other.predict(batch_of(other)).actions)
+    saved = load_file(tmp_path / "model.safetensors")
+    lost = next(weight for weight in saved if "lm_head" not in weight)
+    save_file({weight: tensor for weight, tensor in saved.items() if weight != lost}, tmp_path / "model.safetensors")
+    with pytest.raises(UserError, match=f"lacks {re.escape(renamed(lost, model.network.published))} and 0 other"):
+        make_policy(name, text, trunk=str(tmp_path))
 
 
 @each

@@ -11,13 +11,13 @@ from typing import Any
 import composing
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from arm import ROBOT, SAFETY
 from command_line import SMALL, here
 from exporting import exporter
 from fake_batch import as_policy, make_bc
 from finished_runs import compared
+from lerobot_files import ROWS, column, info
 from test_control_loop import World
 from test_server import serving
 
@@ -122,9 +122,7 @@ def test_parts_of_a_dataset_are_chosen_by_name(dataset: Path) -> None:
 def renamed(dataset: Path, folder: Path, names: Any) -> Path:
     """A copy of the dataset whose action has other names."""
     copy = Path(shutil.copytree(dataset, folder))
-    info = json.loads((copy / "meta/info.json").read_text())
-    info["features"]["action"]["names"] = names
-    (copy / "meta/info.json").write_text(json.dumps(info))
+    info(lambda content: content["features"]["action"].update(names=names))(copy)
     return copy
 
 
@@ -161,11 +159,7 @@ def test_another_recording_is_not_taken_for_the_stored_one(dataset: Path, tmp_pa
     )
     assert not (tmp_path / "store").exists()  # which would block what is asked for next
     here(tmp_path, *import_it)
-    for path in (copy / "data").rglob("*.parquet"):
-        table = pq.read_table(path)
-        values = [[number + 1 for number in row] for row in table["action"].to_pylist()]
-        column = pa.array(values, table.schema.field("action").type)
-        pq.write_table(table.set_column(table.column_names.index("action"), "action", column), path)
+    column(ROWS, "action", lambda table: pa.array((np.array(table["action"].to_pylist(), "f4") + 1).tolist()))(copy)
     assert "store holds other episodes than these" in here(tmp_path, *import_it, ok=False).stderr
 
 

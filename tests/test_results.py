@@ -17,8 +17,6 @@ from vla.runs.files import Change, Training
 from vla.runs.folder import read_run, save_training
 from vla.spec import FIRST_SEED
 
-BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
-
 
 def changed(key: str, value: Any) -> Callable[[str], str]:
     """What makes another text of a JSON object: the value at a key with dots is changed."""
@@ -60,15 +58,12 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     ("file", "content", "says"),
     [
         ("report.json", "{", r"report\.json is damaged or of another kind: .*JSON"),
-        ("report.json", "[" * 10**6, r"report\.json is damaged .*recursion limit"),
         ("report.json", changed("latency_ms", float("nan")), r"latency_ms: Input should be a finite number"),
         ("report.json", changed("seeds", [1]), r"per_episode has other episodes than seeds"),
         ("report.json", changed("conditions", {"dark": 3}), r"conditions\.dark: "),
         *(("report.json", changed(key, value), rf"another kind: .*{re.escape(key)}") for key, value in ODD.items()),
         ("config.yaml", "- 1", r"config\.yaml is damaged or of another kind: Input should be an object"),
-        ("config.yaml", BOMB, r"config\.yaml is nested deeper than \d+ levels, or has aliases"),
         ("config.yaml", "# " + "x" * (2 << 20), r"config\.yaml has \d+ bytes, more than"),
-        ("config.yaml", "a: !!python/object/apply:os.getcwd []", r"config\.yaml is no plain YAML"),
         ("changes.yaml", "- {key: 1, here: 2}", r"\[0\]\.key: .*; \[0\]\.default: Field required"),
         ("training.json", "{}", r"parameters: Field required"),
         ("training.json", changed("checkpoint", "../../other"), r"checkpoint: Unexpected keyword"),

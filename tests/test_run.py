@@ -88,8 +88,6 @@ def test_a_checkpoint_brings_its_task_and_model_and_takes_harder_scenes(home: Pa
     assert report["config"]["task"]["image_size"] == [32, 32]
     assert "purple" in report["config"]["task"]["randomize"]["colour"]["names"]
     assert report["model"] == "bc"
-    refused = here(home, *arguments, "model=rt1_tiny", ok=False)
-    assert refused.stderr.count("\n") == 1 and "model=rt1_tiny" in refused.stderr
 
 
 def test_a_policy_sees_the_pictures_of_its_training_and_those_of_the_other_renderer(
@@ -328,44 +326,6 @@ def test_a_success_rate_is_printed_even_where_the_report_cannot_be_written(home:
     assert sorted(path.name for path in (home / "blocked").iterdir()) == names
 
 
-def test_a_collection_killed_again_and_again_goes_on_and_ends_up_the_same(home: Path, tmp_path: Path) -> None:
-    arguments = [*SMALL, "job=collect", f"collect.folder={tmp_path}/store", "cluster.workers=2"]
-    index = tmp_path / "store/index.jsonl"
-
-    def committed() -> int:
-        return index.read_bytes().count(b"\n") if index.exists() else 0
-
-    for episodes in (1, 4):  # at its first commit, and on the way
-        least = max(episodes, committed() + 1)  # a new one of this process
-
-        def kill(process: int, least: int = least) -> None:
-            until(lambda: committed() >= least)
-            os.kill(process, signal.SIGKILL)
-
-        assert warm.run(home, *arguments, meanwhile=kill).returncode == -signal.SIGKILL
-        assert least <= committed() < 12  # killed on the way, not at its end
-    vla(home, *arguments)
-    (reference,) = (home / "outputs/episodes").iterdir()
-    for file in reference.iterdir():
-        if file.suffix in (".bin", ".jsonl"):
-            assert (tmp_path / "store" / file.name).read_bytes() == file.read_bytes(), file.name
-
-
-def test_a_store_is_chosen_from_another_and_its_damage_is_named(home: Path, tmp_path: Path) -> None:
-    (whole,) = (home / "outputs/episodes").iterdir()
-    where = "inspect.where={seed: [3, 10], placement.yaw: [-2, 2], instruction: '*the*'}"
-    done = here(home, "job=inspect", f"inspect.folder={whole}", where, f"inspect.into={tmp_path}/few")
-    seeds = [entry.seed for entry in EpisodeStore(whole).episodes if 3 <= entry.seed <= 10]
-    assert [entry.seed for entry in EpisodeStore(tmp_path / "few").episodes] == seeds
-    assert len(seeds) > 4 and f"{len(seeds)} intact" in done.stdout
-    assert (tmp_path / "few/card.png").exists()
-    with open(tmp_path / "few/rgb_front.bin", "r+b") as file:
-        file.truncate(file.seek(0, os.SEEK_END) - 1)
-    done = here(home, "job=inspect", f"inspect.folder={tmp_path}/few", ok=False)
-    assert f"{len(seeds) - 1} intact" in done.stdout
-    assert "1 damaged episodes" in done.stderr and "Traceback" not in done.stderr
-
-
 def test_an_episode_is_replayed_into_a_recording(home: Path) -> None:
     (store,) = (home / "outputs/episodes").iterdir()
     replay = ("job=inspect", f"inspect.folder={store}", "output=replay")
@@ -373,17 +333,6 @@ def test_an_episode_is_replayed_into_a_recording(home: Path) -> None:
     recorded = {chunk.entity_path for chunk in RrdReader(home / "replay/episode-2.rrd").stream().to_chunks()}
     assert {"/camera/front/rgb", "/camera/wrist/depth", "/state/rad", "/action/m/executed"} <= recorded
     assert any(path.startswith("/world/panda") for path in recorded)
-    done = here(home, *replay, "inspect.episode=99", ok=False)
-    assert "has no seed 99" in done.stderr and "Traceback" not in done.stderr
-
-
-def test_a_damaged_checkpoint_is_named(home: Path) -> None:
-    weights = Path(shutil.copytree(home / "run/policy", home / "damaged")) / "model.safetensors"
-    whole = weights.read_bytes()
-    weights.write_bytes(whole[: len(whole) // 2])
-    done = here(home, "checkpoint=damaged", "output=cut", ok=False)
-    assert re.fullmatch(r"error: damaged/model\.safetensors is damaged.*\n", done.stderr)
-    assert not (home / "cut").exists()
 
 
 def test_a_bug_gives_a_traceback_and_so_does_a_mistake_where_asked(
@@ -398,11 +347,8 @@ def test_a_bug_gives_a_traceback_and_so_does_a_mistake_where_asked(
         here(tmp_path, "job=report")
 
 
-def test_resuming_refuses_a_changed_identity_and_archives_the_evaluation(home: Path) -> None:
+def test_a_training_that_goes_on_archives_its_evaluation(home: Path) -> None:
     shutil.copytree(home / "run", home / "longer")
-    for other in ("model.width=32", "task/goal=lift", "learner.lr=1"):
-        refused = here(home, "job=train", "resume=longer", "output=longer", other, ok=False)
-        assert other.partition("=")[0].partition("/")[0] in refused.stderr and "Traceback" not in refused.stderr
     done = here(home, "job=train", "resume=longer", "output=longer", "trainer.max_steps=6")
     assert "trained 6 steps" in done.stdout
     # Its evaluation was of the policy before: nothing of it is said of this one.

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import toy_recordable as toy
+from finished_runs import a_report
 from scipy.special import betaln
 
 from vla.parallel.pool import Cluster
@@ -128,29 +129,22 @@ def test_recordings_of_episodes_that_do_not_count_are_removed(tmp_path: Path) ->
     assert [path.name for path in tmp_path.iterdir()] == ["rollouts.rrd"]
 
 
-def a_report(outcomes: str, anytime: bool = True) -> Report:
-    """A success for every 1, an error for every e."""
-    names = {"1": "success", "0": "dropped", "e": "error"}
-    results = [Result(FIRST_SEED + n, names[each], "lift", draws={"n": n}) for n, each in enumerate(outcomes)]
-    return Report(tuple(results), anytime=anytime)
-
-
 def test_a_run_is_compared_on_the_episodes_that_both_played() -> None:
     other = AgainstRun("A", {result.seed: result for result in a_report("0" * 12).results}, 0.02)
-    assert not other.is_decided(a_report("111e11")) and other.is_decided(a_report("1" * 9))
-    assert other.say(a_report("1" * 10 + "e111")).startswith(
+    assert not other.is_decided(a_report("111e11", True)) and other.is_decided(a_report("1" * 9, True))
+    assert other.say(a_report("1" * 10 + "e111", True)).startswith(
         "compared with A on 11 common episodes: better, +100.0 points"
     )
-    stopped, some = replace(other, anytime=True), a_report("1" * 6, anytime=False)
+    stopped, some = replace(other, anytime=True), a_report("1" * 6)
     assert ": better, " in other.say(some) and ": open, " in stopped.say(some)  # six pairs, chosen by when it stopped
     ended = replace(other, results={FIRST_SEED: a_report("0").results[0]})
-    assert ended.is_decided(a_report("1"))  # no later episode can decide
+    assert ended.is_decided(a_report("1", True))  # no later episode can decide
     failed = AgainstRun("A", {result.seed: result for result in a_report("e" + "0" * 12).results}, 0.02)
-    assert not failed.is_decided(a_report("1"))  # the other run did not complete that episode
+    assert not failed.is_decided(a_report("1", True))  # the other run did not complete that episode
     failed.require_common([FIRST_SEED, FIRST_SEED + 1])
     with pytest.raises(ValueError, match="has no episode in common"):
         failed.require_common([FIRST_SEED, FIRST_SEED + 13])
     elsewhere = AgainstRun("A", {FIRST_SEED: Result(FIRST_SEED, "success", "push")}, 0.02)
-    assert elsewhere.say(a_report("1")) == "no episode in common with A"
+    assert elsewhere.say(a_report("1", True)) == "no episode in common with A"
     with pytest.raises(ValueError, match="has no episode in common"):
-        elsewhere.is_decided(a_report("1"))
+        elsewhere.is_decided(a_report("1", True))

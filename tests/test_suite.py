@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from figures import points, spans, texts
+from finished_runs import a_report
 from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
@@ -14,13 +15,6 @@ from rich.console import Console
 from vla.reports.result_tables import conditions_table, plot_conditions
 from vla.rollouts.comparison import SUCCESS, Comparison, compare_conditions
 from vla.rollouts.results import Report, Result
-from vla.spec import FIRST_SEED
-
-
-def a_report(outcomes: str) -> Report:
-    """A success for every 1, an error for every e."""
-    names = {"1": "success", "0": "dropped", "e": "error"}
-    return Report(tuple(Result(FIRST_SEED + index, names[outcome]) for index, outcome in enumerate(outcomes)))
 
 
 def compared(first: str, second: str) -> Comparison:

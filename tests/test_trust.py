@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import pytest
 from composing import CONF, composed, run_job
-from hostile import HANDLER, hostile, node, put
+from hostile import HANDLER, hostile, node, put, ways
 from saved_policies import change_json, save_policy, save_run
 from toy_episodes import EPISODES, add
 
@@ -73,22 +73,14 @@ def test_nothing_that_a_policy_names_is_run(tmp_path: Path, attack: str, monkeyp
     mark = tmp_path / "mark"
     path = run_of(tmp_path / "runs/theirs", *hostile(mark)[attack])
     output = f"output={tmp_path}/runs/mine"  # beside it, as if it were an own run
-
-    def adopted(*options: str) -> Callable[[], None]:
-        return lambda: run_job(adopt(composed(output, f"checkpoint={path}", *options), []))
-
-    ways: dict[str, Callable[[], Any]] = {
-        "evaluate": adopted(),
-        "deploy": adopted("job=deploy", "deploy=ros2"),
-        "benchmark": adopted("job=benchmark"),
+    all_ways = ways(path, output) | {
+        "benchmark": lambda: run_job(adopt(composed(output, f"checkpoint={path}", "job=benchmark"), [])),
         "resume": lambda: run_job(resume(composed(f"output={path}"), path, [])),
-        "pretrained": lambda: run_job(finetune(composed(output, f"pretrained={path}"), [])),
-        "policy": lambda: make_policy(plain(composed().policy), path),  # as evaluate, export and deploy build it
     }
-    untouched = {"a command as a plugin": {*ways} - {"resume"}}
+    untouched = {"a command as a plugin": {*all_ways} - {"resume"}}
     for part in ("task.goal", "an axis"):
         untouched[f"a command as {part}"] = {"pretrained", "policy"}
-    for way, do in ways.items():
+    for way, do in all_ways.items():
         if way in untouched.get(attack, set()):
             continue  # what is wrong there is nothing that this way reads
         with pytest.raises(UserError, match=REFUSED):

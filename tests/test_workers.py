@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import time
 from functools import partial
 from multiprocessing import active_children
 from pathlib import Path
@@ -13,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from collecting import until
 
 from vla.io.errors import UserError
 from vla.parallel.pool import Crashed, ProcessPool
@@ -68,16 +68,20 @@ def test_only_the_item_that_crashes_its_process_twice_is_lost() -> None:
 
 
 class Numbered(Doubling):
-    """Tells which worker of its pool it is."""
+    """Leaves the number of its worker in a folder, and waits until every worker has left one."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
 
     def attempt(self, number: int) -> int:
-        """Wait until every worker has an item."""
-        time.sleep(0.5)
-        return int(os.environ["VLA_WORKER"])
+        (self._folder / os.environ["VLA_WORKER"]).touch()
+        until(lambda: len([*self._folder.iterdir()]) == 2)
+        return number
 
 
-def test_workers_are_numbered() -> None:
-    assert {*results(Numbered, *range(6))} == {0, 1}
+def test_workers_are_numbered(tmp_path: Path) -> None:
+    assert results(partial(Numbered, tmp_path), 4, 5) == [4, 5]
+    assert {path.name for path in tmp_path.iterdir()} == {"0", "1"}
 
 
 def test_an_error_or_result_that_cannot_be_sent_is_told_in_words_and_no_crash() -> None:
