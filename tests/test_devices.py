@@ -9,13 +9,17 @@ import pytest
 import torch
 from fake_batch import MODELS as ALL
 from fake_batch import make_batch, make_rt1, with_text
+from tiny_pi import KINDS, make_policy
+from tiny_vla import make_smolvla
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils import _pytree
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from vla.models.model import Model
 
 MODELS = ALL | {"rt1": partial(make_rt1, proprioception=True)}
+VLAS = {"smolvla": make_smolvla, **{name: partial(make_policy, name) for name in KINDS}}
 
 
 class Call(nn.Module):
@@ -30,13 +34,24 @@ class Call(nn.Module):
         return getattr(self.model, self.method)(batch)
 
 
+class OnGpu(TorchDispatchMode):
+    """Every operation is one of the GPU: a copy from the CPU would wait until it has finished its work."""
+
+    def __torch_dispatch__(self, function: Any, types: Any, arguments: Any = (), named: Any = None) -> Any:
+        """Require that its results are there."""
+        found = function(*arguments, **(named or {}))
+        made = {each.device.type for each in _pytree.tree_leaves(found) if isinstance(each, Tensor)}
+        assert made <= {"cuda"}, function
+        return found
+
+
 @pytest.mark.parametrize("method", ["augment", "loss", "encode", "predict"])
-@pytest.mark.parametrize("name", MODELS)
-def test_nothing_of_a_model_stays_behind_on_the_cpu(name: str, method: str) -> None:
-    model = MODELS[name](shift=(64, 64))
+@pytest.mark.parametrize("name", MODELS | VLAS)
+def test_nothing_of_a_model_is_on_the_cpu(name: str, method: str) -> None:
+    model = (MODELS | VLAS)[name](shift=(64, 64))
     call = Call(model.train(method in ("augment", "loss")), method)
-    batch = with_text(model, make_batch(model.history, model.chunk))
-    with FakeTensorMode() as mode:
+    batch = with_text(model, make_batch(model.history, model.chunk, spec=model.spec))
+    with FakeTensorMode() as mode, OnGpu():
 
         def on_gpu(value: Tensor) -> Tensor:
             return mode.from_tensor(value).to("cuda")

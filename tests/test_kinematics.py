@@ -17,10 +17,15 @@ from vla.spec import Spec
 
 
 @pytest.mark.parametrize("autocast", [False, True])
-def test_it_is_what_the_controller_calculates(autocast: bool) -> None:
+@pytest.mark.parametrize("gpu", [False, True])
+def test_it_is_what_the_controller_calculates(autocast: bool, gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    kinematics = ForwardKinematics(CHAIN)
+    if gpu:  # where training rounds products of matrices
+        monkeypatch.setattr(torch.Tensor, "is_cuda", True)
+        monkeypatch.setattr(torch.Tensor, "__matmul__", None)
     joints = np.random.default_rng(0).uniform(JOINT_LOW, JOINT_HIGH, (2, 50, 7))
     with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
-        poses = ForwardKinematics(CHAIN)(torch.tensor(joints, dtype=torch.float32))
+        poses = kinematics(torch.tensor(joints, dtype=torch.float32))
     exact = np.stack([forward(each)[0][:3, [3, 0, 1]].T.reshape(9) for each in joints.reshape(-1, 7)])
     assert poses.shape == (2, 50, ForwardKinematics.WIDTH)
     np.testing.assert_allclose(poses.reshape(-1, 9).numpy(), exact, atol=1e-6)

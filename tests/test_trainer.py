@@ -28,7 +28,7 @@ from vla.models.lora import LoRA
 from vla.models.model import Model
 from vla.spec import FIRST_SEED, Array, Observation
 from vla.training.checkpoints import SAVE_EVERY, GracefulStop
-from vla.training.closed_loop import ClosedLoop
+from vla.training.closed_loop import ClosedLoop, processes_that_fit
 from vla.training.throughput import TrainingProgressBar
 from vla.training.trainer import explain_memory_errors
 
@@ -144,7 +144,8 @@ def test_out_of_memory_errors_name_the_options_to_lower() -> None:
     )
     with pytest.raises(UserError, match=wanted), explain_memory_errors(sizes):
         fit(make_learner(make_rt1()), batch, 1)
-    for error in (torch.OutOfMemoryError("CUDA out of memory"), MemoryError()):
+    of_cuda = RuntimeError("CUDA error: out of memory"), RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when …")
+    for error in (torch.OutOfMemoryError("CUDA out of memory"), MemoryError(), *of_cuda):
         with pytest.raises(UserError, match=wanted), explain_memory_errors(sizes):
             raise error
     with pytest.raises(RuntimeError, match="shapes"), explain_memory_errors(sizes):
@@ -236,6 +237,17 @@ def test_between_validations_no_environment_is_held(folder: Path, tmp_path: Path
     played = ClosedLoop(make, lambda model: toy.ToyExpert(), range(2), tmp_path / "run")
     train(make_bc(), folder, tmp_path / "run", killer=played)
     assert len(held) >= 4 and held == [1, -1] * (len(held) // 2)
+
+
+@pytest.mark.parametrize(
+    ("device", "gpu", "free", "expected"), [("cpu", 8e9, 8e9, 2666), ("cuda", 8e9, 64e9, 7), ("cuda", 99e9, 4e9, 3)]
+)
+def test_workers_have_room_for_a_small_model_and_on_a_gpu_for_its_libraries(
+    device: str, gpu: float, free: float, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vla.training.closed_loop.memory_of", lambda device: (0.0, gpu))
+    monkeypatch.setattr("vla.training.closed_loop.free_memory", lambda: free)
+    assert processes_that_fit(torch.device(device), 1e6) == expected
 
 
 @pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["bc", "rt1"])

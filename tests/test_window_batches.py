@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,6 +43,29 @@ def test_memory_is_used_again_once_nothing_refers_to_it() -> None:
     assert memory.empty((2, 3), torch.uint8).__array_interface__["data"] != place
     del tensor
     assert memory.empty((2, 3), torch.uint8).__array_interface__["data"] == place
+
+
+def test_what_a_gpu_reads_is_page_locked_and_without_gaps(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pinned, empty = set[int](), torch.empty
+
+    def allocated(*size: Any, pin_memory: bool = False, **options: Any) -> torch.Tensor:
+        made = empty(*size, **options)
+        pinned.update([made.data_ptr()] if pin_memory else ())
+        return made
+
+    def pin(tensor: torch.Tensor) -> torch.Tensor:
+        pinned.add(tensor.data_ptr())
+        return tensor
+
+    monkeypatch.setattr(torch, "empty", allocated)
+    monkeypatch.setattr(torch.Tensor, "pin_memory", pin)
+    store = EpisodeStore(folder)
+    batch, plain = (WindowBatcher(store, 2, 3, for_gpu)(np.arange(8)) for for_gpu in (True, False))
+    tensors = [name for name, values in plain.items() if isinstance(values, torch.Tensor)]
+    pairs = [(batch[name], plain[name]) for name in tensors]
+    pairs += [(batch["rgb"][camera], images) for camera, images in plain["rgb"].items()]
+    for one, other in pairs:
+        assert torch.equal(one, other) and one.is_contiguous() and one.data_ptr() in pinned
 
 
 def test_rows_in_random_order_are_those_of_the_file(tmp_path: Path) -> None:

@@ -119,14 +119,15 @@ class WindowBatcher:
         batch: Batch = {"rgb": {camera: self._take(rows, frames, absent) for camera, rows in self._images.items()}}
         numbers = self._take(self._numbers, frames, absent)
         state = self._numbers.shape[1] - self._truth_size
-        batch["state"] = numbers[..., :state]
+        batch["state"] = self._own(numbers[..., :state])
         if self._truth_size:
-            batch["truth"] = numbers[..., state:]
+            batch["truth"] = self._own(numbers[..., state:])
         actions = self._take(self._actions, labels)
-        batch["action"], batch["executed"] = actions[..., : self._action_size], actions[..., self._action_size :]
-        batch["present"] = self._own(present)
-        batch["valid"] = self._own(inside & (before == 0))
-        batch["perturbations"] = self._own(np.where(inside, before, -1))
+        batch["action"] = self._own(actions[..., : self._action_size])
+        batch["executed"] = self._own(actions[..., self._action_size :])
+        batch["present"] = self._own(torch.from_numpy(present))
+        batch["valid"] = self._own(torch.from_numpy(inside & (before == 0)))
+        batch["perturbations"] = self._own(torch.from_numpy(np.where(inside, before, -1)))
         batch["instruction"] = [self._instructions[number] for number in episode.tolist()]
         return batch
 
@@ -152,9 +153,9 @@ class WindowBatcher:
             return torch.empty(shape, dtype=dtype, pin_memory=True).numpy()
         return self._buffers.empty(shape, dtype)
 
-    def _own(self, values: Array) -> torch.Tensor:
-        tensor = torch.from_numpy(values)
-        return tensor.pin_memory() if self._pin else tensor
+    def _own(self, tensor: torch.Tensor) -> torch.Tensor:
+        """Return a tensor as a GPU reads it: page-locked and without gaps, which would be closed in other memory."""
+        return tensor.contiguous().pin_memory() if self._pin else tensor
 
 
 class JoinedBatcher:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from vla.io.errors import UserError
 from vla.io.types import Inherited, Layers, NonNegative, Steps
 from vla.models.chunking import after_prefix, with_prefix
-from vla.models.layers import Batch, mean_where, transformer_decoder
+from vla.models.layers import Batch, draws, mean_where, transformer_decoder
 from vla.models.model import ContextModel, Prediction
 
 Denoise = Callable[[Tensor, Tensor], Tensor]  # noisy actions (B, k, D) and times → (B, k, D), with a context
@@ -126,14 +126,14 @@ class DenoisingModel(ContextModel):
         action = self.scaled(batch["action"][:, -1]).repeat(self.copies, 1, 1)  # (R·B, k, D)
         context = output["context"].repeat(self.copies, 1, 1)
         padding = output["padding"].repeat(self.copies, 1) if "padding" in output else None
-        generator = None if self.training else torch.Generator().manual_seed(0)
-        noise = torch.randn(action.shape, generator=generator).to(action)
-        uniform = torch.rand(len(action), generator=generator).to(action)
+        how = draws(self.training, action.device)
+        noise = torch.randn(action.shape, **how).to(action)
+        uniform = torch.rand(len(action), **how).to(action)
         noisy, time, target = self.corrupt(action, noise, uniform)
         counted = batch["valid"][:, -1].repeat(self.copies, 1)
         if self.prefix:
             executed = self.scaled(batch["executed"][:, -1]).repeat(self.copies, 1, 1)
-            length = torch.randint(self.prefix + 1, (len(action),), generator=generator).to(time.device)
+            length = torch.randint(self.prefix + 1, (len(action),), **how).to(time.device)
             noisy, time = with_prefix(noisy, time, executed, length)
             counted = after_prefix(batch["perturbations"][:, -1].repeat(self.copies, 1), length)
         error = (self.denoiser(noisy, time, context, padding).float() - target).square()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from vla.models.layers import Batch
+from vla.models.layers import Batch, exact_product
 from vla.spec import Spec
 
 
@@ -69,13 +69,12 @@ class ForwardKinematics(nn.Module):
 
     def forward(self, joints: Tensor) -> Tensor:
         """Map (…, J) joint positions [rad] to (…, 9): position [m] and x and y axes of the tool, float32."""
-        # In bfloat16 the error would be millimetres.
-        with torch.autocast(joints.device.type, enabled=False):
-            angles = joints.float()[..., None, None]
-            transforms = self.fixed + angles.cos() * self.cosine + angles.sin() * self.sine  # (…, J, 4, 4)
-            while (count := transforms.shape[-3]) > 1:  # all products of neighbours at once
-                pairs = transforms[..., 0 : count - 1 : 2, :, :] @ transforms[..., 1:count:2, :, :]
-                transforms = torch.cat([pairs, transforms[..., count - 1 :, :, :]], -3) if count % 2 else pairs
+        angles = joints.float()[..., None, None]
+        transforms = self.fixed + angles.cos() * self.cosine + angles.sin() * self.sine  # (…, J, 4, 4)
+        while (count := transforms.shape[-3]) > 1:  # all products of neighbours at once
+            # In bfloat16 the error would be millimetres.
+            pairs = exact_product(transforms[..., 0 : count - 1 : 2, :, :], transforms[..., 1:count:2, :, :])
+            transforms = torch.cat([pairs, transforms[..., count - 1 :, :, :]], -3) if count % 2 else pairs
         pose = transforms[..., 0, :3, :]
         return torch.cat([pose[..., 3], pose[..., 0], pose[..., 1]], -1)
 

@@ -74,6 +74,25 @@ def mean_where(values: Tensor, mask: Tensor) -> Tensor:
     return (values * mask).sum() / mask.sum().clamp(min=1)
 
 
+def exact_product(left: Tensor, right: Tensor) -> Tensor:
+    """Return the product of small matrices, (…, N, K) and (…, K, M), in float32 also where others are rounded.
+
+    Autocast rounds factors to bfloat16, and training on a GPU to TensorFloat-32, which has 10 bits.
+    """
+    if left.is_cuda:
+        return (left.unsqueeze(-1) * right.unsqueeze(-3)).sum(-2)
+    with torch.autocast(left.device.type, enabled=False):
+        return left @ right
+
+
+def draws(training: bool, device: torch.device) -> dict[str, Any]:
+    """Return arguments for torch's functions of random numbers: outside training they are the same on every device.
+
+    In training they are made on the device: it would have to finish its work before it gets a copy.
+    """
+    return {"device": device} if training else {"generator": torch.Generator().manual_seed(0)}
+
+
 def newest(present: Tensor) -> Tensor:
     """Return the (B,) index of the last of the (B, T) frames that is present."""
     return (present * torch.arange(1, present.shape[1] + 1, device=present.device)).argmax(1)

@@ -294,5 +294,5 @@ class TokenModel(Model):
         frame, logits = newest(batch["present"]), self(batch)["logits"]
         if logits.shape[1] != batch["present"].shape[1]:
             raise UserError(f"{type(self).__name__}.forward must return logits for every frame of its history")
-        logits = logits[torch.arange(len(frame)), frame].float()  # (B, k, D, K)
+        logits = logits[torch.arange(len(frame), device=frame.device), frame].float()  # (B, k, D, K)
         return Prediction(self.tokenizer.decode_logits(logits), logits.softmax(-1))

@@ -16,6 +16,7 @@ from lightning import Callback, LightningModule, Trainer
 from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.models.policy_folder import BEST
+from vla.parallel.limits import free_memory
 from vla.parallel.pool import Crashed, Future, ProcessPool
 from vla.parallel.processes import one_thread_each
 from vla.rollouts.evaluate import play_episode
@@ -27,6 +28,7 @@ from vla.training.device import memory_of
 log = logging.getLogger(__name__)
 
 ROOM = 3  # memory of a process with a model, as a multiple of its weights: they arrive pickled, and the model acts
+OF_GPU = 1e9  # memory of a process that uses a GPU, without its model: of the GPU, and of the machine [bytes]
 PER_WORKER = 5  # episodes; for fewer, a process takes longer to start than they take
 
 
@@ -125,7 +127,7 @@ class ClosedLoop(Callback):
         As many worker processes play them as have memory for a model each; if that is one only, this process plays.
         """
         size = sum(weight.nbytes for weight in learner.model.parameters())
-        workers = min(workers, int(memory_of(learner.device)[1] / (ROOM * size)))
+        workers = min(workers, processes_that_fit(learner.device, size))
         with one_thread_each():
             if workers <= 1:
                 with learner.evaluating():
@@ -163,6 +165,12 @@ class ClosedLoop(Callback):
         self.success = state_dict["success"]
         if self._path.exists() and state_dict["seeds"] == list(self._seeds):
             self.best = state_dict["best"]
+
+
+def processes_that_fit(device: torch.device, size: float) -> int:
+    """Return how many processes have memory for a model of `size` [bytes] on a device, each with a copy of its own."""
+    own = OF_GPU if device.type == "cuda" else 0
+    return int(min(memory_of(device)[1], free_memory()) / (ROOM * size + own))
 
 
 def _results(future: Future, seeds: Sequence[int]) -> list[Result]:

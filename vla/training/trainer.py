@@ -36,6 +36,8 @@ log = logging.getLogger(__name__)
 
 PRECISIONS = {"fp32": "32-true", "bf16": "bf16-mixed"}  # config → Lightning
 SIZE_KEYS = ("data.batch_size", "model.context.history", "model.image_size", "model.chunk", "model.width")
+# In errors of PyTorch: on a CPU, on a GPU, and of a library of CUDA that finds no room for what it needs.
+OUT_OF_MEMORY = ("can't allocate memory", "out of memory", "ALLOC_FAILED", "ALLOCATION_FAILED")
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 MAX_MMAP_THRESHOLD = 2**25  # [B]
 
@@ -137,7 +139,7 @@ def explain_memory_errors(config: Mapping[str, Any]) -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, (MemoryError, torch.OutOfMemoryError)) and "can't allocate memory" not in str(error):
+        if not isinstance(error, MemoryError) and not any(sign in str(error) for sign in OUT_OF_MEMORY):
             raise
         raise UserError(f"training needs more memory than available: {what_to_lower(config)}") from error
 

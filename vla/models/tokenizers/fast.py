@@ -16,6 +16,7 @@ from torch import Tensor
 
 from vla.io.errors import UserError
 from vla.io.types import Bins, Positive, Steps
+from vla.models.layers import exact_product
 from vla.models.tokenizers.tokenizer import MIN_SPAN, ActionStatistics, ActionTokenizer, data_bounds
 from vla.spec import Spec
 
@@ -97,7 +98,7 @@ class Fast(ActionTokenizer):
             values = [ord(character) - FIRST_CODE_POINT + self._least for character in text]
             rows.append(values + [0] * (count - len(values)))
         coefficients = torch.tensor(rows, dtype=torch.float32, device=tokens.device)
-        scaled = _exact(self.basis.T, coefficients.view(-1, self.chunk, self.components)) / self.scale
+        scaled = exact_product(self.basis.T, coefficients.view(-1, self.chunk, self.components)) / self.scale
         return (scaled * self.spread + self.centre).view(*tokens.shape[:-1], self.chunk, self.components)
 
     def loss_mask(self, tokens: Tensor, perturbations: Tensor) -> Tensor:
@@ -148,19 +149,17 @@ class Fast(ActionTokenizer):
         self._pieces = ["" if number == self.end else piece for piece, number in vocabulary]
 
     def _round(self, actions: Tensor) -> Tensor:
-        """Transform (…, k, D) actions to (…, k, D) rounded coefficients, by frequency and component."""
+        """Transform (…, k, D) actions to (…, k, D) rounded coefficients, by frequency and component.
+
+        Less than full precision would change some.
+        """
         inside = torch.minimum(torch.maximum(actions, self.low), self.high)
-        return (_exact(self.basis, (inside - self.centre) / self.spread) * self.scale).round()
+        return (exact_product(self.basis, (inside - self.centre) / self.spread) * self.scale).round()
 
     def _texts(self, coefficients: Tensor) -> list[str]:
         """Convert (…, k, D) coefficients to one text of k·D characters per chunk."""
         codes = (coefficients - self._least + FIRST_CODE_POINT).long().reshape(-1, self.chunk * self.components)
         return ["".join(map(chr, row)) for row in codes.tolist()]
-
-
-def _exact(matrix: Tensor, values: Tensor) -> Tensor:
-    with torch.autocast(values.device.type, enabled=False):  # half precision would change coefficients
-        return matrix @ values
 
 
 def cosines(count: int) -> Tensor:

@@ -20,7 +20,7 @@ from torch import Tensor
 from vla.io.errors import UserError
 from vla.io.types import Natural, NonNegative, Shift, Steps, Text
 from vla.models.chunking import after_prefix, require_prefix, with_prefix
-from vla.models.layers import Batch, mean_where, newest
+from vla.models.layers import Batch, draws, mean_where, newest
 from vla.models.model import Model, Prediction
 from vla.models.tokenizers.tokenizer import ActionTokenizer
 from vla.models.vlm.network import FlowNetwork, Prefix
@@ -149,12 +149,11 @@ class VisionLanguageAction(Model):
 
         Outside training they are always the same.
         """
-        generator = None if self.training else torch.Generator().manual_seed(0)
-        count = self.copies * len(batch["state"])
-        noise = torch.randn(count, *self.noise.shape, generator=generator)
-        uniform = torch.rand(count, generator=generator)
+        how, count = draws(self.training, self.noise.device), self.copies * len(batch["state"])
+        noise = torch.randn(count, *self.noise.shape, **how)
+        uniform = torch.rand(count, **how)
         time = MIN_TIME + (1 - MIN_TIME) * uniform ** (1 / SHAPE)  # uniform ** (2 / 3) ~ Beta(1.5, 1)
-        length = torch.randint(self.prefix + 1, (count,), generator=generator).to(self.noise.device)
+        length = torch.randint(self.prefix + 1, (count,), **how).to(self.noise.device)
         return {**batch, "noise": noise.to(self.noise), "time": time.to(self.noise), "length": length}
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:

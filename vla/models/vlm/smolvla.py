@@ -125,7 +125,10 @@ class SmolVLA(FlowNetwork):
             words = (read * sentence.unsqueeze(-1)).sum(1)
             seen = self.keypoints(every, words.repeat_interleave(images.shape[1], 0))
         else:
-            seen = self.vlm.connector(self.vlm.vision_model(pixel_values=every).last_hidden_state)
+            patches = self.resolution // self.vision["patch_size"]
+            whole = sentence.new_ones(len(every), patches, patches)  # by default it is made on the CPU and copied
+            encoded = self.vlm.vision_model(pixel_values=every, patch_attention_mask=whole)
+            seen = self.vlm.connector(encoded.last_hidden_state)
             seen = seen * math.sqrt(seen.shape[-1])
         return seen.unflatten(0, images.shape[:2])
 

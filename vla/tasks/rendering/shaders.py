@@ -62,7 +62,8 @@ vec3 shine(int number, vec3 place, vec3 normal, vec3 colour, vec4 material) {
     }
     float facing = dot(normal, towards);
     vec3 sum = (lights[first].rgb + max(facing, 0.0) * lights[first + 1].rgb) * colour;
-    float glance = pow(max(dot(normal, normalize(towards + normalize(eye.xyz - place))), 0.0), material.z);
+    float half_way = dot(normal, normalize(towards + normalize(eye.xyz - place)));
+    float glance = half_way > 0.0 ? pow(half_way, material.z) : 0.0;  // pow(0, 0) is undefined
     return strength * (sum + (facing > 0.0 ? glance * material.y : 0.0) * lights[first + 2].rgb);
 }
 """
