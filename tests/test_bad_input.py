@@ -46,6 +46,14 @@ BAD_INPUT = {
     "--task=recorded": "--task is no option: write task=recorded, without dashes",
     "-m seed=0,1 --cfg job": "--cfg shows the config of one run: leave out -m",
     "+experiment=standard": "experiment has an option already, which experiment=OPTION replaces: leave out the +",
+    "+model=bc": "comes from two options of one group: leave out the +",
+    "logger=null": "logger=null: logger takes the name of an option, as in logger=none, see --help",
+    "-m logger=tensorboard,null": "logger takes the name of an option, as in logger=none",
+    "model/image/pretrained=false": "see --help; a value has dots, model.image.pretrained=false",
+    "~job": "~job leaves no job: choose another one, job=OPTION",
+    "experiment=[rt1,few]": "experiment=[rt1,few] names several: experiment takes one option",
+    "=3": "=3 has no key: write KEY=3",
+    "--resolve": "--resolve goes with --cfg job",
     "task.goal=lift": "got 'lift': an option is chosen with a slash, task/goal=lift",
     "-m seed=range(0,0)": "the sweep has no cells: one of its ranges or choices is empty",
     "-m trainer=ddp trainer.accelerator=cpu trainer.devices=2 seed=0": "add trainer.devices=1, or hydra/launcher=sub",
@@ -87,7 +95,8 @@ NONSENSE = {
         trainer.accumulate_grad_batches=0 trainer.devices=-7 trainer.val_check_interval=0.5
         trainer.val_check_interval=null trainer.max_epochs=3 trainer.max_epochs=null trainer.devices=abc
         trainer.devices='1,x' trainer.gradient_clip_val=-1 trainer.limit_val_batches=-1 +trainer.limit_train_batches=0
-        trainer.precision=17 model.text.words=2147483647
+        trainer.check_val_every_n_epoch=0 trainer.check_val_every_n_epoch=2 trainer.precision=17
+        model.text.words=2147483647
     """,
     "evaluate": """
         evaluate.episodes=0 evaluate.seed=3 policy.precision=16

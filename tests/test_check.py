@@ -295,6 +295,37 @@ def test_a_checkpoint_keeps_its_tokenizer_and_model(override: str, checkpoint: P
         adopt(config(job="evaluate", checkpoint=str(checkpoint)), [override])
 
 
+def test_what_can_no_longer_change_a_policy_is_said_and_its_report_does_not_show_it(
+    checkpoint: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    given = [f"checkpoint={checkpoint}", "learner.lr=1.0", "seed=5", "evaluate.episodes=3"]
+    adopted = adopt(composed(*given), given)
+    assert (adopted.learner.lr, adopted.evaluate.episodes) == (1e-4, 3)
+    assert "learner.lr=1.0, seed=5 has no effect on the policy of checkpoint=" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("overrides", "end"),
+    [
+        (("experiment=libero", "tokenizer=rt1"), "; experiment=libero sets it: ~tokenizer.smoothing removes it"),
+        (
+            ("experiment=libero_varied", "model/image=efficientnet_lite0"),
+            "; experiment=libero_varied sets it: model.image.channels=VALUE replaces it",
+        ),
+        (
+            ("experiment=few", "model=smolvla_tiny"),
+            "; experiment=few chooses it, unless the command does: model/text=OPTION",
+        ),
+        (("experiment=libero", "tokenizer.bins=1"), "tokenizer.bins must be greater than or equal to 2, got 1"),
+    ],
+)
+def test_what_an_experiment_sets_for_other_options_is_told_from_what_was_typed(
+    overrides: tuple[str, ...], end: str
+) -> None:
+    with pytest.raises(ValueError, match=f"{re.escape(end)}$"):
+        check(composed(*overrides))
+
+
 @pytest.mark.parametrize("partial", [True, "false", 1, None, [False]])
 def test_a_factory_is_refused_where_an_object_belongs(partial: Any) -> None:
     """As a group it passed the check, without all of its arguments, and ended in a traceback when it was built."""

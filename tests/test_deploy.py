@@ -222,6 +222,20 @@ def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monk
     assert (report["successes"], report["episodes"], report["errors"], report["seeds"]) == (1, 1, 1, [5, 6])
 
 
+@pytest.mark.parametrize(
+    ("override", "sentence"),
+    [
+        ("deploy.agent.topics.commands=/other", r"deploy\.agent\.topics and deploy\.simulator\.topics differ"),
+        ("deploy.simulator.network.domain=7", r"deploy\.agent\.network and deploy\.simulator\.network differ"),
+        ("deploy.simulator.seed=999999", "seed=999999: seeds below 1000000 are those of demonstrations"),
+    ],
+)
+def test_a_loop_that_would_report_something_else_is_refused(override: str, sentence: str, tmp_path: Path) -> None:
+    agent = ("agent=remote", "agent.url=ws://127.0.0.1:1")
+    with pytest.raises(ValueError, match=sentence):
+        job.run(Experiment.of(composed("job=deploy", "deploy=loop", *agent, override, f"output={tmp_path}")))
+
+
 def test_a_loop_that_is_interrupted_before_an_episode_is_over_leaves_no_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -269,6 +283,7 @@ def test_arguments_of_ros_are_split_off() -> None:
         ([CHECKPOINT, "deploy=ros2", "--ros-args", "--nonsense"], "--nonsense"),
         ([CHECKPOINT, "deploy=loop", "deploy.agent.command=trajectory"], "obeys deploy.agent.command=joint_state only"),
         ([CHECKPOINT, "deploy=simulator", "deploy.joints_hz=25"], "joints_hz=25 must be a multiple of the task's 10"),
+        ([CHECKPOINT, "deploy=simulator", "~deploy.topics.images.wrist"], "no topic for the task's cameras wrist"),
         ([CHECKPOINT, "deploy=ros2", "~deploy.topics.images.wrist"], "wrist"),
     ],
 )

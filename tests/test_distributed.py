@@ -112,6 +112,7 @@ def test_two_processes_of_a_trainer_see_every_window_once_between_them(folder: P
     [
         (("trainer=fsdp",), {}, "gpu"),
         (("trainer=ddp", "trainer.strategy=dpp"), {}, "dpp"),
+        (("trainer.devices=[0]",), {}, "should be an int > 0"),
         (("trainer=ddp", "trainer.devices=3"), TORCHRUN, "does not match the world size"),
     ],
 )

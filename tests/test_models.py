@@ -27,6 +27,7 @@ from vla.models.diffusion import Diffusion
 from vla.models.flow import Flow
 from vla.models.layers import RunningNormalizer
 from vla.models.model import Model
+from vla.models.vlm.prompt import Prompt
 
 MOTIONS = Motions()
 MODELS: dict[str, Callable[..., Model]] = {
@@ -122,6 +123,12 @@ def test_validation_leaves_the_random_numbers_of_training_alone(name: str) -> No
     first, second = model.loss(batch)["loss"], model.loss(batch)["loss"]
     model.predict(batch)
     assert torch.equal(torch.get_rng_state(), before) and first == second
+
+
+@pytest.mark.parametrize("name", ["bc", "rt1", "decoder", *NUMBERS])
+def test_a_text_encoder_that_makes_tokens_is_refused_where_a_vector_is_needed(name: str) -> None:
+    with pytest.raises(ValueError, match=r"needs a vector of the sentence, and Prompt makes .* model/text=ngrams"):
+        MODELS[name](text=partial(Prompt, None, 20, False))
 
 
 @pytest.mark.parametrize("name", ["bc", "rt1", "decoder", *NUMBERS])

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from command_line import SMALL, here
+from defaults import defaults_of, part_of
 from safetensors.torch import load_file, save_file
 from tiny_pi import KINDS, SIZES, SPEC, batch_of, make_network, make_policy, observed, take_statistics, write_tokenizer
 from tiny_vla import REFERENCE, deviation, published, reference
@@ -17,9 +19,10 @@ from torch import Tensor
 
 from vla.config.compose import compose
 from vla.io.errors import UserError
+from vla.models.tokenizers.tokenizer import Uniform
 from vla.models.vlm.network import renamed
-from vla.models.vlm.policy import last_of
-from vla.models.vlm.prompt import PADDING
+from vla.models.vlm.policy import VisionLanguageAction, last_of
+from vla.models.vlm.prompt import PADDING, WORDS, Prompt
 from vla.models.vlm.smolvla import SmolVLA
 
 TOLERANCE = 1e-5
@@ -113,6 +116,16 @@ def test_it_trains_and_is_evaluated_and_saved_like_any_other_model(name: str, ho
     here(home, *SMALL, f"model={name}", *network, *tiny, f"output={name}", f"hydra.run.dir={name}")
     assert json.loads((home / name / "policy/config.json").read_text())["model"]["chunk"] == 8
     assert (home / name / "policy/model.safetensors").is_file() and list((home / name).rglob("report.json"))
+
+
+def test_a_network_that_reads_the_state_in_the_sentence_needs_it_there() -> None:
+    options = {**part_of("model/pi05", "text", name=None, length=20), "state": False}
+    network = partial(make_network, "pi05", vocabulary=WORDS)
+    tokenizer = Uniform(spec=SPEC, **defaults_of("tokenizer/uniform"))
+    with pytest.raises(ValueError, match=r"PI05 sees the state in the sentence only: model\.text\.state=true"):
+        VisionLanguageAction(
+            *(network, partial(Prompt, **options)), **defaults_of("model/pi05"), spec=SPEC, tokenizer=tokenizer
+        )
 
 
 def test_what_actions_see_of_a_prompt_does_not_end_with_its_padding(tmp_path: Path) -> None:

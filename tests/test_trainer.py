@@ -16,13 +16,16 @@ import lightning
 import pytest
 import torch
 import toy
+from composing import composed
 from defaults import defaults_of
 from fake_batch import as_policy, make_act, make_batch, make_bc, make_denoising, make_rt1
 from omegaconf import OmegaConf
 from resuming import STEPS, STOP, VALIDATED, same, train
 from small_training import fit, make_learner
 
+from vla.config.experiment import Experiment
 from vla.io.errors import UserError
+from vla.jobs.train import warn_of_length
 from vla.models.diffusion import Diffusion
 from vla.models.lora import LoRA
 from vla.models.model import Model
@@ -131,6 +134,27 @@ def test_it_logs_how_fast_it_is_and_what_it_waits_for(folder: Path, tmp_path: Pa
         pace = [row for row in csv.DictReader(file) if row["pace/samples_per_s"]]
     assert len(pace) == STEPS // 2
     assert all(float(row["pace/samples_per_s"]) > 0 and 0 <= float(row["pace/waiting"]) <= 1 for row in pace)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ((), []),
+        (("trainer.max_steps=1000", "learner.warmup_steps=1000"), ["does not reach its peak"]),
+        (
+            ("trainer.max_steps=499", "trainer.accumulate_grad_batches=2"),
+            ["is more than the 998 batches: no validation"],
+        ),
+        (("trainer.max_steps=500", "trainer.accumulate_grad_batches=2"), []),
+        (("trainer.max_steps=-1",), ["learner.schedule=cosine has no end"]),
+        (("trainer.max_steps=-1", "learner.schedule=constant"), []),
+    ],
+)
+def test_what_never_happens_in_a_training_is_said(
+    overrides: tuple[str, ...], said: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    warn_of_length(Experiment.of(composed(*overrides)))
+    assert len(caplog.messages) == len(said) and all(text in caplog.text for text in said)
 
 
 def test_out_of_memory_errors_name_the_options_to_lower() -> None:

@@ -27,7 +27,7 @@ from vla.config.check import check, devices
 from vla.config.compose import CONF, offer_axes, substitutes, with_variant
 from vla.config.compose import compose as compose_again
 from vla.config.experiment import Experiment
-from vla.config.packages import offer_options, trust
+from vla.config.packages import config_folders, offer_options, trust
 from vla.deploy import ros
 from vla.io.errors import UserError, suggestion
 from vla.io.printable import printable
@@ -62,6 +62,8 @@ def _described(error: Exception) -> str:
             group = re.split(r"Could not \w+ '", text)[-1].partition("'")[0]
             adds = f"+{group}=OPTION adds it, if the chosen {group.rpartition('/')[0]} takes one"
             return f"no option chosen has the group '{group}': {adds}; --help lists them"
+        if text.endswith("appears more than once in the final defaults list"):  # of an option that is there twice
+            return f"{text.partition(' ')[0]} comes from two options of one group: leave out the +, or name one of them"
         if text.startswith("Multiple values for "):
             group = text.removeprefix("Multiple values for ").partition(". ")[0]
             return f"{group} has an option already, which {group}=OPTION replaces: leave out the +, or name it once"
@@ -221,11 +223,32 @@ def _require_plain(arguments: list[str]) -> None:
     pickle, which may run anything; options can be abbreviated."""
     if {"-m", "--multirun"} & {*arguments} and any(each.partition("=")[0] in ("-c", "--cfg") for each in arguments):
         raise UserError("--cfg shows the config of one run: leave out -m, and give every key one value")
+    if "--resolve" in arguments and not any(each.startswith(("-c", "--cfg", "-h", "--help")) for each in arguments):
+        raise UserError("--resolve goes with --cfg job, which shows the config")
     for name, _, value in (each.partition("=") for each in arguments if "=" in each):
         if name.startswith("--") and not any(option.startswith(name) for option in OPTIONS):
             raise UserError(f"{name} is no option: write {name.strip('-')}={value}, without dashes")
     if any(len(name := each.partition("=")[0]) > 2 and PICKLE.startswith(name) for each in arguments):
         raise UserError(f"{PICKLE} runs whatever a file says: compose the run again from its command line")
+
+
+def _require_options(arguments: list[str]) -> None:
+    """Refuse values where groups take names of options, and a command without a job, which are tracebacks of Hydra."""
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        group, folders = name.lstrip("+~").partition("@")[0], config_folders()
+        if argument.startswith("~") and group in ("job", "experiment"):
+            raise UserError(f"{argument} leaves no {group}: choose another one, {group}=OPTION")
+        if equals and not name:
+            raise UserError(f"{argument} has no key: write KEY{argument}")
+        if group in ("job", "experiment") and value.startswith("["):
+            raise UserError(f"{argument} names several: {group} takes one option")
+        is_group = "/" in group or any((folder / group).is_dir() for folder in folders)
+        if is_group and any(re.fullmatch(r"(?i:null|true|false)|[+-]?\d+(\.\d+)?", each) for each in value.split(",")):
+            none = any((folder / group / "none.yaml").is_file() for folder in folders)
+            hint = f", as in {group}=none" if none else ""
+            dotted = f"; a value has dots, {group.replace('/', '.')}={value}" if "/" in group else ""
+            raise UserError(f"{argument}: {group} takes the name of an option{hint}, see --help{dotted}")
 
 
 def _require_ranks() -> None:
@@ -245,6 +268,7 @@ def main() -> None:
     sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])
     try:
         _require_plain(sys.argv[1:])
+        _require_options(sys.argv[1:])
         _require_ranks()
         offer_options()
         offer_axes()

@@ -7,6 +7,7 @@ training (with job=improve also task, expert and learner), `resume=RUN` all of a
 from __future__ import annotations
 
 import copy
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,14 @@ from vla.models.checkpoint import read_header
 from vla.models.policy_folder import POLICY, REQUIRED_NODES, read_policy
 from vla.models.trunk_folder import is_trunk
 
+log = logging.getLogger(__name__)
+
 LAST = Path("checkpoints/last.ckpt")  # in the folder of a training
 # How a policy was trained, beside task, tokenizer and model: what rounds continue, and what a report on it shows.
 OF_TRAINING = ("expert", "data", "learner", "validate", "collect.episodes", "collect.seed")
 SCHEDULE = ("val_check_interval", "accumulate_grad_batches", "gradient_clip_val", "precision")  # of the trainer
 REPORTED = (*OF_TRAINING, "seed", "trainer.max_steps", *(f"trainer.{name}" for name in SCHEDULE))
+OVER = ("seed", "data", "learner", "trainer", "logger", "validate")  # keys that do not change a trained policy
 MACHINES = ("accelerator", "devices", "num_nodes", "strategy")  # keys that trainer=OPTION changes in a resumed run
 # With other values of these keys a resumed run is another training.
 IDENTITY = (
@@ -48,6 +52,12 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     require_no_paths(saved, REQUIRED_NODES, cfg.checkpoint, _given(parsed))
     values = _values(saved, REQUIRED_NODES)
     if cfg.job == "evaluate":
+        if over := [each for each in parsed if _path(each).partition(".")[0] in OVER]:
+            text = (
+                "%s has no effect on the policy of checkpoint=, which is evaluated as it is; pretrained= trains further"
+            )
+            log.warning(text, ", ".join(str(each.input_line) for each in over))
+        parsed = [each for each in parsed if each not in over]  # a report shows the training as it was
         values |= _values(saved, REPORTED)
         # Only an open-loop evaluation builds one of them.
         values |= {"expert": without_paths(saved, "expert")} if "expert" in saved else {}

@@ -103,6 +103,7 @@ NARROWER: dict[str, dict[str, Any]] = {
         "accumulate_grad_batches": Count,
         "gradient_clip_val": NonNegative | None,
         "val_check_interval": Count,
+        "check_val_every_n_epoch": Literal[1] | None,
         "limit_val_batches": Natural | Share | None,
         "limit_train_batches": Count | Annotated[float, Gt(0), Le(1)] | None,
         "log_every_n_steps": Count,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, fields
 from inspect import Parameter
@@ -10,9 +10,11 @@ from typing import Any
 
 from vla.config.annotations import MissingLibrary, fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_arguments, check_node, makes, require_known
+from vla.config.differences import ABSENT, at
 from vla.config.experiment import Experiment
 from vla.config.nodes import Evaluation, Rounds, Settings, Validation, with_changes
 from vla.config.packages import config_folders
+from vla.io.documents import read_yaml
 from vla.io.errors import UserError
 
 OF_EVERY_JOB = ("collect", "validate", "evaluate")
@@ -45,8 +47,18 @@ class Job:
 def check(experiment: Experiment, job: Job) -> None:
     """Check every node of an experiment that its `job` will build against the signature of its class.
 
-    There is a UserError for an unknown, missing or ill-typed key, with its dotted name and the allowed values.
+    There is a UserError for an unknown, missing or ill-typed key, with its dotted name and the allowed values; it says
+    so if the value is one that the chosen experiment sets.
     """
+    try:
+        _check(experiment, job)
+    except UserError as error:
+        if origin := _of_experiment(experiment.nodes, str(error)):
+            raise UserError(f"{error}; {origin}") from error
+        raise
+
+
+def _check(experiment: Experiment, job: Job) -> None:
     config = experiment.nodes
     values = {each.name: config[each.name] for each in fields(Settings) if each.name in config}
     groups = {name: GROUPS[name] for name in OF_EVERY_JOB} | job.needs(config)
@@ -77,6 +89,32 @@ def check(experiment: Experiment, job: Job) -> None:
             method = locate("policy.chunking._target_", chunking["_target_"])
             require_chunking(method, kinds[1], config["model"].get("prefix", 0))
     _check_contents(experiment, groups)
+
+
+def _of_experiment(config: Mapping[str, Any], error: str) -> str:
+    """Say how to undo what the chosen experiment sets at the key that an error begins with; "" if it does not."""
+    name, key = at(config, "chosen.experiment"), error.partition(" ")[0]
+    if "." not in key or config.get("checkpoint") is not None:  # which brings that of its own training
+        return ""
+    for content in _experiments(str(name)):
+        path = key.replace(".", "/")
+        if any(f"override /{path}" in entry for entry in content.get("defaults", ()) if isinstance(entry, dict)):
+            return f"experiment={name} chooses it, unless the command does: {path}=OPTION"
+        if at(content, key) not in (ABSENT, {}) and at(content, key) == at(config, key):
+            way_out = f"~{key} removes it" if f"{key} is unknown" in error else f"{key}=VALUE replaces it"
+            return f"experiment={name} sets it: {way_out}"
+    return ""
+
+
+def _experiments(name: str) -> Iterator[dict[str, Any]]:
+    """Yield the content of an experiment's file, and of those that it extends."""
+    files = (folder / "experiment" / f"{name}.yaml" for folder in config_folders())
+    if file := next((file for file in files if file.is_file()), None):
+        content = read_yaml(file, dict[str, Any])
+        yield content
+        for other in content.get("defaults", ()):
+            if isinstance(other, str) and other != "_self_":
+                yield from _experiments(other)
 
 
 def _check_group(node: Any, group: Group, may_lack: bool) -> None:

@@ -78,6 +78,12 @@ class Loop:
             raise UserError(
                 "deploy=loop: the simulator obeys deploy.agent.command=joint_state only, without deploy.agent.dry_run"
             )
+        for name in ("topics", "network"):
+            if getattr(agent, name) != getattr(simulator, name):
+                raise UserError(
+                    f"deploy=loop: agent and simulator would not hear each other, because deploy.agent.{name} and "
+                    f"deploy.simulator.{name} differ: change both alike"
+                )
         context = get_context("spawn")
         processes = [
             context.Process(target=_run, args=(node, ros_arguments), daemon=True) for node in (agent, simulator)

@@ -34,7 +34,7 @@ class SimulatorNode(Node):
 
         Raises:
             UserError: the environment has no robot, is not `TakesJointTargets`, or gives several instructions in a
-                row, or a control step is not a whole number of ticks.
+                row, a control step is not a whole number of ticks, or a camera has no topic.
         """
         rates, topics, limits = (settings.joints_hz, settings.camera_hz), settings.topics, settings.robot
         self._model = environment.spec.require_robot("deploy=simulator")
@@ -48,6 +48,8 @@ class SimulatorNode(Node):
             raise UserError(
                 f"the simulator's joints_hz={rates[0]:g} must be a multiple of the task's {control_hz:g} Hz"
             )
+        if unnamed := [camera for camera in environment.spec.cameras if camera not in topics.images]:
+            raise UserError(f"no topic for the task's cameras {', '.join(unnamed)}: name them in deploy.topics.images")
         super().__init__("vla_simulator")
         self.environment, self._drivable, self._limits, self.seed = environment, environment, limits, settings.seed - 1
         self._period, self._frame_period, self._command_timeout = 1 / rates[0], 1 / rates[1], settings.command_timeout

@@ -12,16 +12,21 @@ from vla.io.printable import printable
 from vla.models.policy_folder import require_unseen
 from vla.reports.evaluation import plot_report, write_report
 from vla.runs.folder import PLOT, REPORT
+from vla.spec import FIRST_SEED
 
 
 def run(experiment: Experiment) -> None:
     """Run the deployment until done or interrupted; report a measured success rate like an evaluation.
 
-    There is a UserError if an episode of the deployment selected the weights, or if one ended in an error.
+    There is a UserError if an episode of the deployment may have been trained on or selected the weights, or if one
+    ended in an error.
     """
     seed, episodes = (at(experiment["deploy"], key, None) for key in ("simulator.seed", "episodes"))
-    if experiment.checkpoint is not None and seed is not None and episodes is not None:
-        require_unseen(experiment.checkpoint, "deploy.simulator.seed", range(seed, seed + episodes))
+    if seed is not None and episodes is not None:  # whose success is reported
+        if seed < FIRST_SEED:
+            raise UserError(f"deploy.simulator.seed={seed}: seeds below {FIRST_SEED} are those of demonstrations")
+        if experiment.checkpoint is not None:
+            require_unseen(experiment.checkpoint, "deploy.simulator.seed", range(seed, seed + episodes))
     policy, environment = partial(_policy, experiment), experiment.make_environment()
     deployment = experiment.build("deploy", policy=policy, environment=environment, output=experiment.output)
     if getattr(deployment, "needs_policy", True) and experiment.checkpoint is experiment.make_agent() is None:

@@ -67,8 +67,7 @@ def train(experiment: Experiment) -> Path | None:
         return chosen if first_process() else None
     quiet_lightning()
     graceful_stop, closed_loop = GracefulStop(output / CHECKPOINTS), _closed_loop(experiment)
-    if experiment["trainer"]["max_steps"] in (None, -1) and experiment["learner"]["schedule"] == "cosine":
-        log.warning("without trainer.max_steps learner.schedule=cosine has no end: the learning rate stays at its peak")
+    warn_of_length(experiment)
     with closed_loop or nullcontext(), training_lock(output / CHECKPOINTS):
         # Before collection, so that missing devices are reported early.
         callbacks = [
@@ -87,6 +86,23 @@ def train(experiment: Experiment) -> Path | None:
             return None
     log.info("the policy is %s", output / POLICY)
     return output / POLICY
+
+
+def warn_of_length(experiment: Experiment) -> None:
+    """Log a warning of what never happens in a training of so many steps."""
+    learner, trainer = experiment["learner"], experiment["trainer"]
+    steps, interval = trainer["max_steps"], trainer["val_check_interval"]
+    if steps in (None, -1):
+        if learner["schedule"] == "cosine":
+            text = "without trainer.max_steps learner.schedule=cosine has no end: the learning rate stays at its peak"
+            log.warning(text)
+        return
+    if steps <= learner["warmup_steps"]:
+        text = "trainer.max_steps=%d ends within learner.warmup_steps=%d: the learning rate does not reach its peak"
+        log.warning(text, steps, learner["warmup_steps"])
+    if interval > (batches := steps * trainer["accumulate_grad_batches"]):
+        text = "trainer.val_check_interval=%d is more than the %d batches: no validation, and the last weights are used"
+        log.warning(text, interval, batches)
 
 
 def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_stop: GracefulStop) -> None:

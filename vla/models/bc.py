@@ -31,6 +31,7 @@ class BC(TokenModel):
         self, image: Callable[..., ImageEncoder], keypoints: Width, proprioception: bool, **inherited: Inherited
     ) -> None:
         super().__init__(**inherited)
+        self.require_vector()
         make_encoder = partial(image, text_width=self.text.width)
         self.features = KeypointFeatures(keypoints, proprioception, make_encoder, self.spec)
         self.mlp = mlp(sum([*self.features.image_widths, *self.features.state_widths, self.text.width]), self.width)

@@ -99,6 +99,14 @@ class Model(nn.Module, ABC):
         self.robot_state = RobotState(spec)
         self.add_truth_head(width, auxiliary)
 
+    def require_vector(self) -> None:
+        """Raise a UserError unless the text encoder makes a vector of a sentence."""
+        if not self.text.vectors:
+            raise UserError(
+                f"{type(self).__name__} needs a vector of the sentence, and {type(self.text).__name__} makes tokens: "
+                "choose another text encoder, such as model/text=ngrams"
+            )
+
     def add_truth_head(self, width: int, auxiliary: float) -> None:
         """Add the head that predicts the simulator state from features of a width, unless its loss weight is 0."""
         self.auxiliary = auxiliary
@@ -252,6 +260,8 @@ class ContextModel(Model):
         super().__init__(**inherited)
         self.context = context(image=image, text_width=self.text.width, width=self.width, spec=self.spec)
         self.history = self.context.history
+        if self.context.takes_vector:
+            self.require_vector()
 
     def encode(self, batch: Batch) -> Tensor | None:
         """Return tokens of each frame, as `Context.encode`."""

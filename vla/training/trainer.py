@@ -118,9 +118,9 @@ def _trainer(node: Mapping[str, Any], **options: Any) -> Trainer:
         if isinstance(trainer.strategy, ParallelStrategy) and trainer.strategy.cluster_environment:
             # Compare the number of processes with the cluster now; Lightning would only at the start of training.
             trainer.strategy.cluster_environment.validate_settings(trainer.num_devices, trainer.num_nodes)
-    except (MisconfigurationException, RuntimeError, ValueError) as error:
+    except (MisconfigurationException, RuntimeError, TypeError, ValueError) as error:
         names = ("accelerator", "devices", "num_nodes", "strategy", "precision")
-        chosen = {name: node[name] for name in names if isinstance(node.get(name), str | int)}
+        chosen = {name: node[name] for name in names if isinstance(node.get(name), str | int | list)}
         anywhere = chosen.get("accelerator") in ("auto", "cpu") and "strategy" not in node
         if anywhere and chosen.get("devices") == 1:  # no machine lacks that
             raise UserError(f"Lightning refuses the trainer: {error}") from error

@@ -34,6 +34,8 @@ class TextEncoder(nn.Module, ABC):
         width: length of the vector.
     """
 
+    vectors = True  # else `forward` returns tokens, for a model that reads them itself
+
     def __init__(self, width: int) -> None:
         super().__init__()
         self.width = width

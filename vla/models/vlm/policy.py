@@ -62,7 +62,7 @@ class VisionLanguageAction(Model):
 
     Raises:
         UserError: state or actions have too many components, a camera is unknown, the trunk does not fit, the
-            vocabulary is too small for words, or `prefix` leaves fewer actions than are executed.
+            vocabulary is too small for words, the state is nowhere, or `prefix` leaves fewer actions than are executed.
     """
 
     uses_tokens = False
@@ -103,6 +103,8 @@ class VisionLanguageAction(Model):
                 f"model.network.vocabulary={self.network.vocabulary} is less than the {WORDS} words of a prompt "
                 "without a tokenizer: raise it, or give model.text.name"
             )
+        if not (self.network.state_width or self.text.state):
+            raise UserError(f"{type(self.network).__name__} sees the state in the sentence only: model.text.state=true")
         self.add_truth_head(self.network.value_width, auxiliary)
         pack(self.network)
         _require_width("state", len(spec.pose), self.network.state_width or len(spec.pose))

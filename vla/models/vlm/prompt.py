@@ -45,6 +45,8 @@ class Prompt(TextEncoder):
         UserError: there is no such tokenizer.
     """
 
+    vectors = False
+
     numbers: Tensor  # (BINS + 1, W) tokens of " -1" to " 255"
     end: Tensor  # tokens after the numbers
 
