@@ -104,7 +104,7 @@ WRONG = (
         "tokenizer=fast",
     ),
     *(
-        "trainer=gpu",
+        "trainer.accelerator=gpu",
         "trainer=fsdp",
         "trainer.precision=8",
     ),

@@ -62,7 +62,7 @@ BAD_INPUT = {
     "-m experiment=ablation variant=no_transformer model=rt1_small seed=0": "is model=bc: omit model=rt1_small",
     "experiment=recipe": "experiment=recipe is a grid of runs: add -m",
     f"seed={'[' * 200}{']' * 200}": "nested too deep",
-    f"trainer=gpu {' '.join(item for item in SMALL if 'accelerator' not in item)}": "gpu",
+    f"trainer.accelerator=gpu {' '.join(item for item in SMALL if 'accelerator' not in item)}": "gpu",
 }
 
 

@@ -52,7 +52,7 @@ def test_two_processes_learn_what_one_learns_from_batches_twice_as_large(
     folder: Path, together: Path, pair: str, tmp_path: Path
 ) -> None:
     model = f"model={pair.partition(',')[2]}"
-    found = train(folder, tmp_path, "trainer=cpu", model, "data.batch_size=16")
+    found = train(folder, tmp_path, "trainer.accelerator=cpu", model, "data.batch_size=16")
     assert torch.load(together / pair / "found.pt", weights_only=True) == pytest.approx(found, rel=1e-3)
     require_equal(tmp_path / LAST, together / pair / LAST, untrained(folder, model))
 
@@ -80,7 +80,7 @@ def test_what_several_processes_leave_is_a_policy_like_any_other(together: Path,
 
 
 def test_training_goes_on_with_another_number_of_processes(folder: Path, together: Path, tmp_path: Path) -> None:
-    longer = ("trainer=cpu", "model=decoder", "data.batch_size=16", "trainer.max_steps=6")
+    longer = ("trainer.accelerator=cpu", "model=decoder", "data.batch_size=16", "trainer.max_steps=6")
     train(folder, tmp_path / "on", *longer, checkpoint=together / "fsdp,decoder" / LAST)
     train(folder, tmp_path / "whole", *longer)
     start = untrained(folder, "model=decoder")
@@ -122,13 +122,15 @@ def test_what_the_machine_lacks_is_said_before_anything_is_done(
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     on = [] if overrides == ("trainer=fsdp",) else ["trainer.accelerator=cpu"]
-    with pytest.raises(ValueError, match=f"is not available here .*{says}.*: try trainer=cpu"):
+    with pytest.raises(ValueError, match=f"is not available here .*{says}.*: try trainer=auto"):
         make_trainer(composed("model=rt1_tiny", *overrides, *on).config, None)
 
 
 def test_what_lightning_refuses_is_not_blamed_on_the_machine() -> None:
     with pytest.raises(ValueError, match=r"^Lightning refuses the trainer: .*algorithm"):
-        make_trainer(composed("model=rt1_tiny", "trainer=cpu", "+trainer.gradient_clip_algorithm=nrom").config, None)
+        make_trainer(
+            composed("model=rt1_tiny", "trainer.accelerator=cpu", "+trainer.gradient_clip_algorithm=nrom").config, None
+        )
 
 
 def test_ddp_trains_on_two_processes_and_evaluates_once(home: Path) -> None:

@@ -28,7 +28,7 @@ def test_the_steps_leave_their_figures(tmp_path: Path) -> None:
     assert facts["cores"] and facts["torch"] and "limits" not in facts
     assert collected["collect"]["status"] == 0 and "6 episodes" in " ".join(collected["collect"]["log"])
     assert trained["bc"]["training"]["steps"] == 3 and trained["bc"]["metrics"][0]["train/loss"] > 0
-    assert large["smolvla_tiny"]["training"]["steps"] == 10 and "smolvla_tiny,model/text=words" in large["latency"]
+    assert large["smolvla_tiny"]["training"]["steps"] == 10 and "smolvla_tiny,model.text.name=null" in large["latency"]
     assert sum(trained["bc_evaluated"]["outcomes"].values()) == 1 and trained["bc_evaluated"]["latency_ms"] > 0
 
 

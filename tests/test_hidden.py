@@ -24,7 +24,7 @@ def test_nothing_that_is_hidden_acts(attack: str, tmp_path: Path, monkeypatch: p
     monkeypatch.setenv("ATTACK_SECRET", SECRET)
     mark = tmp_path / "mark"
     with listener() as (port, connected):
-        config = hiding(plain(composed("expert=waypoint", "trainer=cpu")), mark, port)[attack]
+        config = hiding(plain(composed("expert=waypoint", "trainer.accelerator=cpu")), mark, port)[attack]
         path = save(tmp_path / "theirs", config)
         small = ("output=mine", "cluster.workers=1", "evaluate.episodes=1", "recorder=none")
         for way, do in ways(path, *small).items():

@@ -158,7 +158,7 @@ def test_a_name_of_no_linear_map_is_told_with_those_there_are(module: str) -> No
 
 def test_a_configuration_chooses_the_factors_and_a_checkpoint_has_them(folder: Path, tmp_path: Path) -> None:
     chosen = (
-        "trainer=cpu",
+        "trainer.accelerator=cpu",
         "model=decoder",
         "learner/lora=low_rank",
         "learner.lora.modules=[decoder]",

@@ -316,8 +316,8 @@ def test_it_is_collected_learnt_and_reported_by_tier(tmp_path: Path) -> None:
     printed = here(
         tmp_path,
         *("task=metaworld", "task.tasks=[handle-press,coffee-push]", "task.image_size=[32,32]", "task.steps=80"),
-        *("collect.episodes=2", "cluster.workers=1", "trainer=cpu", "trainer.max_steps=2", "validate.episodes=0"),
-        *("trainer.val_check_interval=2", "data.batch_size=4", "data.validation_fraction=0"),
+        *("collect.episodes=2", "cluster.workers=1", "trainer.accelerator=cpu", "trainer.max_steps=2"),
+        *("validate.episodes=0", "trainer.val_check_interval=2", "data.batch_size=4", "data.validation_fraction=0"),
         *("model.width=16", "model.keypoints=4", "model.text_width=8", "evaluate.episodes=2", "recorder=none"),
         "output=run",
     ).stdout

@@ -41,8 +41,14 @@ OWN_MODEL = (DOCS / "models.md").read_text(encoding="utf-8").split("## A model o
 COMMANDS = re.findall(r"^python -m vla\.run (.*)$", PAGE, re.MULTILINE)
 MODEL = "mypackage.models.Mine"
 TINY = (
-    *("validate.episodes=2", "collect.episodes=12", "cluster.workers=2", "evaluate.episodes=3", "trainer=cpu"),
-    *("trainer.max_steps=4", "trainer.val_check_interval=4", "data.batch_size=8", "data.validation_windows=8"),
+    *("validate.episodes=2", "collect.episodes=12", "cluster.workers=2", "evaluate.episodes=3"),
+    *(
+        "trainer.accelerator=cpu",
+        "trainer.max_steps=4",
+        "trainer.val_check_interval=4",
+        "data.batch_size=8",
+        "data.validation_windows=8",
+    ),
 )
 
 

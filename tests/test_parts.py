@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 CPU = {"_target_": "vla.policy.Policy", **defaults_of("policy/default", device="cpu")}
 HUGGING_FACE = "vla.models.text.huggingface.HuggingFace"
-SMALL = ("task.image_size=[32,32]", "trainer=cpu", "recorder=none")
+SMALL = ("task.image_size=[32,32]", "trainer.accelerator=cpu", "recorder=none")
 
 
 def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy, Path]:

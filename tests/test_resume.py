@@ -50,16 +50,16 @@ def test_a_training_without_rounds_is_not_resumed_as_one(tmp_path: Path) -> None
 def test_a_run_is_resumed_with_its_config_in_its_folder(tmp_path: Path) -> None:
     leave(
         tmp_path / "one",
-        plain(composed("job=train", "model.width=17", "collect.episodes=3", *OF_TRAINER)),
+        plain(composed("job=train", "model.width=17", "collect.episodes=3", "trainer.accelerator=cpu", *OF_TRAINER)),
         finished=False,
     )
-    now = composed(f"output={tmp_path}/now", "trainer=cpu", "trainer.gradient_clip_val=2", "evaluate.episodes=7")
-    said = ["trainer=cpu", "trainer.gradient_clip_val=2", "evaluate.episodes=7"]
+    now = composed(f"output={tmp_path}/now", "trainer=auto", "trainer.gradient_clip_val=2", "evaluate.episodes=7")
+    said = ["trainer=auto", "trainer.gradient_clip_val=2", "evaluate.episodes=7"]
     resumed = resume(now, tmp_path / "one", said)
     assert (resumed.job, resumed.output) == ("train", str(tmp_path / "one"))
     assert (resumed.model.width, resumed.collect.episodes, resumed.evaluate.episodes) == (17, 3, 7)
-    assert (resumed.trainer.accelerator, resumed.trainer.gradient_clip_val) == ("cpu", 2)
-    assert (resumed.trainer.max_steps, resumed.trainer.precision) == (9, "bf16")  # of the run, not of trainer=cpu
+    assert (resumed.trainer.accelerator, resumed.trainer.gradient_clip_val) == ("auto", 2)
+    assert (resumed.trainer.max_steps, resumed.trainer.precision) == (9, "bf16")  # of the run, not of trainer=auto
     longer = resume(now, tmp_path / "one", ["trainer={max_steps: 12}"])  # which merges, as in Hydra
     assert (longer.trainer.max_steps, longer.trainer.precision) == (12, "bf16")
     with pytest.raises(ValueError, match="omit checkpoint="):

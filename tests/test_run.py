@@ -50,7 +50,7 @@ def test_the_key_of_a_server_is_in_no_file_of_a_training(tmp_path: Path, monkeyp
 def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     report = json.loads((home / "run/report.json").read_text())
     assert {"success", "episodes", "ci_low", "ci_high", "seeds", "outcome_counts", "checkpoint", "config"} <= {*report}
-    assert (report["experiment"], report["model"]) == ("none", "bc")
+    assert (report["experiment"], report["model"]) == (None, "bc")
     assert {result["task"] for result in report["per_episode"]} == {"pick_place"}
     training = json.loads((home / "run/training.json").read_text())
     assert report["episodes"] == 2 and report["errors"] == 0
@@ -169,7 +169,7 @@ def test_the_nearest_demonstration_is_evaluated_like_a_policy_and_beside_one(hom
     report = json.loads((home / "nearest/report.json").read_text())
     assert (report["model"], report["checkpoint"], report["episodes"], report["errors"]) == ("nearest", None, 2, 0)
     assert done.stdout.strip().splitlines()[-1].startswith(f"success {report['successes']}/2 (")
-    policy = ("checkpoint=run", "evaluate=memory", "evaluate.episodes=2", "cluster.workers=1")
+    policy = ("checkpoint=run", "evaluate.without=[images,instruction]", "evaluate.episodes=2", "cluster.workers=1")
     (folder,) = (home / "outputs/episodes").iterdir()
     done = here(home, *policy, f"evaluate.nearest={folder}", "recorder=none", "output=beside_nearest")
     beside = json.loads((home / "beside_nearest/report.json").read_text())["conditions"]
@@ -182,7 +182,7 @@ def test_the_nearest_demonstration_is_evaluated_like_a_policy_and_beside_one(hom
 def test_an_evaluation_ends_when_what_it_is_asked_is_decided(home: Path) -> None:
     policy = ("checkpoint=run", "cluster.workers=1", "task.time_limit=0.2", "recorder=none")
     asked = (*policy, "evaluate.episodes=40", "evaluate.until=decided", "evaluate.margin=0.9")
-    done = here(home, *asked, "evaluate.bar=0.5", "evaluate=memory", "output=beside")
+    done = here(home, *asked, "evaluate.bar=0.5", "evaluate.without=[images,instruction]", "output=beside")
     report = json.loads((home / "beside/report.json").read_text())
     assert report["conditions"].keys() == {"without_images", "without_instruction"}
     blind = report["conditions"]["without_images"]
@@ -286,7 +286,7 @@ def test_cells_run_at_the_same_time_and_one_that_fails_leaves_the_others_alone(h
 
 def test_the_menu_lists_jobs_and_options(home: Path) -> None:
     menu = here(home, "--help").stdout
-    assert "task/goal: chain, lift, mixed, mixed_or_stay, pick_place, pick_place_or_stay, pick_place_two, " in menu
+    assert "task/goal: chain, lift, mixed, pick_place, pick_place_or_stay, pick_place_two, " in menu
     assert "  evaluate    The default: collect, train and report a success rate" in menu
 
 

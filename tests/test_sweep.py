@@ -119,7 +119,7 @@ def test_cells_that_failed_are_left_out_and_a_sweep_without_any_writes_nothing(t
 
 
 def test_agents_without_a_model_are_rows_too(tmp_path: Path) -> None:
-    cell(tmp_path, 0, ["agent=checkpoint"], 9)
+    cell(tmp_path, 0, ["model=bc"], 9)
     (tmp_path / "1/.hydra").mkdir(parents=True)
     (tmp_path / "1/.hydra/overrides.yaml").write_text("- agent=expert\n")
     write_report(Report((Result(0, "success"),)), tmp_path / "1/report.json", None, {})

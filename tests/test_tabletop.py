@@ -101,7 +101,7 @@ def test_an_episode_without_success_ends_at_the_time_limit_and_says_why(tabletop
         (["task.blocks=7"], r"task\.blocks must be from 2 to 6"),
         (["task.blocks=6", "task/goal=stay"], r"task\.blocks must be from 2 to 5"),
         # An impossible instruction names a colour that neither a block nor the held-out part has.
-        (["task.blocks=5", "task/goal=mixed_or_stay"], r"task\.blocks must be from 3 to 4"),
+        (["task.blocks=5", "task/goal=mixed", "task.goal.impossible=0.1"], r"task\.blocks must be from 3 to 4"),
     ],
 )
 def test_what_the_scene_cannot_have_is_refused(overrides: list[str], message: str) -> None:

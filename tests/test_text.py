@@ -55,7 +55,9 @@ def test_tokens_are_the_same_in_every_process_whatever_the_case_but_not_the_orde
     ],
 )
 def test_names_of_colours_mean_basic_terms(said: str, meant: str) -> None:
-    knowing, plain = (NGrams(width=8, **defaults_of(f"model/text/{option}")) for option in ("colours", "ngrams"))
+    knowing, plain = (
+        NGrams(width=8, **defaults_of("model/text/ngrams", basic_colours=known)) for known in (True, False)
+    )
     assert torch.equal(knowing.tokenize([said]), plain.tokenize([meant]))
     assert (said == meant) == torch.equal(plain.tokenize([said]), plain.tokenize([meant]))
 

@@ -62,7 +62,7 @@ def toy_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run_of(path: Path, key: str, value: Any) -> Path:
     """A run whose configuration is the default one but for a key."""
-    config = plain(composed("expert=clean", "trainer=cpu"))
+    config = plain(composed("expert=clean", "trainer.accelerator=cpu"))
     put(config, key, value)
     return save_run(path, config)
 
@@ -92,7 +92,7 @@ def test_nothing_that_a_policy_names_is_run(tmp_path: Path, attack: str, monkeyp
 def test_nothing_that_a_store_names_is_run(tmp_path: Path, attack: str, toy_store: Path) -> None:
     mark = tmp_path / "mark"
     key, value = hostile(mark)[attack]
-    config = {"task": plain(composed("expert=clean", "trainer=cpu"))["task"], "expert": {}}
+    config = {"task": plain(composed("expert=clean", "trainer.accelerator=cpu"))["task"], "expert": {}}
     put(config, key if key.startswith("task.") else "task.goal", value)
     shutil.copytree(toy_store, tmp_path / "store")
     header = json.loads((tmp_path / "store/store.json").read_text())

@@ -36,5 +36,5 @@ def test_the_tutorial_ends_with_a_policy_for_its_own_goal(tmp_path: Path) -> Non
     report = json.loads((tmp_path / "outputs/runs/left_of/report.json").read_text(encoding="utf-8"))
     assert report["config"]["task"]["goal"]["_target_"].endswith(".LeftOf")
     assert {result["task"] for result in report["per_episode"]} == {"left_of"}
-    levels = json.loads((tmp_path / "outputs/runs/left_of_levels/report.json").read_text(encoding="utf-8"))
+    levels = json.loads((tmp_path / "outputs/runs/left_of_wide/report.json").read_text(encoding="utf-8"))
     assert levels["conditions"]["wide"]["compared"]

@@ -17,7 +17,8 @@ from typing import Any
 import warm
 
 SMALL = ("task.image_size=[32,32]", "task.shadows=false", "collect.episodes=12", "cluster.workers=2")
-TRAIN = (*SMALL, "job=train", "validate.episodes=0", "data.batch_size=4", "trainer.max_steps=4", "trainer=cpu")
+TRAIN = (*SMALL, "job=train", "validate.episodes=0", "data.batch_size=4", "trainer.max_steps=4")
+TRAIN += ("trainer.accelerator=cpu",)
 EVALUATE = ("evaluate.episodes=1", "cluster.workers=1", "recorder=none")
 CHECKPOINT = "run"
 LIMIT = 100.0  # [s] that a command may take

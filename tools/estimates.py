@@ -20,7 +20,7 @@ TRAININGS: dict[str, tuple[str, ...]] = {
     "the same, `learner.checkpointing=true`": (*LARGE, "learner.checkpointing=true"),
     "the same with LoRA": (*LARGE, "learner.checkpointing=true", *IN_PARTS),
 }
-SHORT = ("job=train", "trainer=cpu", "trainer.max_steps=40", "validate.episodes=0", "logger=none")
+SHORT = ("job=train", "trainer.accelerator=cpu", "trainer.max_steps=40", "validate.episodes=0", "logger=none")
 PROGRAM = """
 import time
 from types import SimpleNamespace

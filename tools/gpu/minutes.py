@@ -44,7 +44,7 @@ class Sizes(NamedTuple):
     plans: int
     precision: str
     compiled: bool
-    trainer: str
+    device: str  # trainer.accelerator
     vlas: dict[str, str]  # vision-language-action model → what LoRA freezes
     slower: int = 1  # factor of all limits
 
@@ -125,7 +125,7 @@ class Minutes:
                     files.extractall(self.work, filter="data")
                 os.utime(there)
         libraries = subprocess.run(["ldconfig", "-p"], capture_output=True, text=True).stdout
-        if "libEGL.so.1" not in libraries and self.sizes.trainer == "gpu":
+        if "libEGL.so.1" not in libraries and self.sizes.device == "gpu":
             for package in sorted(kit.glob("gl/*.deb")):
                 subprocess.run(["dpkg", "-x", str(package), "/"], check=True)
             subprocess.run(["ldconfig"], check=True)
@@ -211,7 +211,7 @@ class Minutes:
         """Time a training of the large model."""
         sizes = self.sizes
         timing = [f"benchmark.steps={sizes.timed}", "benchmark.rounds=1", f"benchmark.compile=[{compiled}]"]
-        what = [f"model={sizes.model}", f"trainer={sizes.trainer}", f"data.batch_size={batch}"]
+        what = [f"model={sizes.model}", f"trainer.accelerator={sizes.device}", f"data.batch_size={batch}"]
         asked = ["job=benchmark", "benchmark.names=[train]", f"benchmark.precisions=[{precision}]"]
         self.vla(step, name, limit, *asked, *timing, *what, *self.data(sizes.used))
 
@@ -237,7 +237,11 @@ class Minutes:
     def train(self, step: str, name: str, limit: float, steps: int, compiled: bool, *overrides: str) -> None:
         """Train a policy without validations, eager if it cannot be compiled, then evaluate it."""
         sizes = self.sizes
-        settings = [f"trainer={sizes.trainer}", f"trainer.precision={sizes.precision}", f"trainer.max_steps={steps}"]
+        settings = [
+            f"trainer.accelerator={sizes.device}",
+            f"trainer.precision={sizes.precision}",
+            f"trainer.max_steps={steps}",
+        ]
         settings += [f"trainer.val_check_interval={NEVER}", f"trainer.log_every_n_steps={min(20, steps)}"]
         settings += ["job=train", "validate.episodes=0", *overrides]
         for each in (name, f"{name}_eager", f"{name}_evaluated", f"{name}_eager_evaluated"):
@@ -248,7 +252,7 @@ class Minutes:
             ended = self.vla(step, name, limit, "learner.compile=False", *settings)
         if ended["status"] == 0:
             asked = [f"checkpoint={self.work / 'runs' / name}", f"evaluate.episodes={sizes.evaluated}"]
-            asked += ["cluster.policy=here", f"policy.lanes={min(sizes.workers, 16)}"] if sizes.trainer == "gpu" else []
+            asked += ["cluster.policy=here", f"policy.lanes={min(sizes.workers, 16)}"] if sizes.device == "gpu" else []
             self.vla(step, f"{name}_evaluated", 150, *asked)
 
     def e(self) -> None:
@@ -262,7 +266,7 @@ class Minutes:
         """Train a few steps with the strategies for several devices, on one."""
         sizes = self.sizes
         for strategy in ("ddp", "fsdp"):
-            where = [f"trainer={strategy}", "trainer.devices=1", f"trainer.accelerator={sizes.trainer}"]
+            where = [f"trainer={strategy}", "trainer.devices=1", f"trainer.accelerator={sizes.device}"]
             length = [f"trainer.max_steps={sizes.timed + 8}", f"trainer.val_check_interval={NEVER}"]
             what = ["model=rt1_tiny", "validate.episodes=0", f"trainer.precision={sizes.precision}"]
             self.vla("f", strategy, 60, "job=train", *where, *length, *what, *self.data(sizes.used))
@@ -271,11 +275,15 @@ class Minutes:
         """Take ten steps of LoRA with vision-language-action models of random weights, and time their plans."""
         sizes = self.sizes
         for name, frozen in sizes.vlas.items():
-            what = [f"model={name}", "model/text=words", "learner=smolvla", "learner/lora=low_rank"]
+            what = [f"model={name}", "model.text.name=null", "learner=smolvla", "learner/lora=low_rank"]
             length = ["trainer.max_steps=10", f"trainer.val_check_interval={NEVER}", "validate.episodes=0"]
-            how = [f"trainer={sizes.trainer}", f"trainer.precision={sizes.precision}", f"learner.frozen=[{frozen}]"]
+            how = [
+                f"trainer.accelerator={sizes.device}",
+                f"trainer.precision={sizes.precision}",
+                f"learner.frozen=[{frozen}]",
+            ]
             self.vla("v", name, 120, "job=train", "data.batch_size=8", *what, *length, *how, *self.data(sizes.used))
-        models = [f"{name},model/text=words" for name in sizes.vlas]
+        models = [f"{name},model.text.name=null" for name in sizes.vlas]
         asked = [str(self._demonstrations), str(sizes.used), str(sizes.plans), str(sizes.compiled)]
         self.run("v", "plans", 110, sys.executable, str(PROBE), "latency", str(self.out / "v.json"), *asked, *models)
 

@@ -3,7 +3,7 @@
     make .venv/parity/lerobot-0.4.4
     OMP_NUM_THREADS=1 PYTHONPATH=.venv/parity/lerobot-0.4.4:tools/parity:tests:. python -m vla.run job=benchmark \\
       benchmark.names=[policy] +benchmark.peer._target_=smolvla_peer.Peer +benchmark.peer._partial_=true \\
-      trust=[smolvla_peer] model=smolvla model/text=words
+      trust=[smolvla_peer] model=smolvla model.text.name=null
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
-from vla.data.window_batches import Batch, JoinedBatcher, WindowBatcher
+from vla.data.window_batches import Batch, WindowBatcher, joined
 from vla.io.errors import UserError
 from vla.io.types import Count, Natural, Rate, Seed
 from vla.spec import Array, Spec
@@ -157,7 +157,22 @@ class WindowDataModule(LightningDataModule):
         self.training_windows = np.concatenate(trained)  # row numbers
         self.held_out_windows = np.concatenate([np.empty(0, np.int64), *unseen])
         layout = self._history, self._chunk, self._on_gpu(), self._spec.truth_size
-        self.make_batch = JoinedBatcher([WindowBatcher(store, *layout) for store in stores], rows)
+        self._batchers, self._starts = [WindowBatcher(store, *layout) for store in stores], np.cumsum([0, *rows])[:-1]
+
+    def make_batch(self, windows: Array) -> Batch:
+        """Return the batch of `windows` (B,), row numbers store by store; its windows are in the order of their stores.
+
+        There is a UserError as of `WindowBatcher`.
+        """
+        store = self._starts.searchsorted(windows, side="right") - 1
+        numbers = np.unique(store).tolist()
+        parts = [self._batchers[number](windows[store == number] - self._starts[number]) for number in numbers]
+        return parts[0] if len(parts) == 1 else joined(parts)
+
+    def verify(self) -> None:
+        """Raise a UserError if images differ from their checksums, which otherwise the first batch of each tells."""
+        for batcher in self._batchers:
+            batcher.verify()
 
     def state_dict(self) -> dict[str, Any]:
         """Return a digest of the demonstrations and the size of a batch over all processes, saved with checkpoints."""

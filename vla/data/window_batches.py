@@ -158,36 +158,12 @@ class WindowBatcher:
         return tensor.contiguous().pin_memory() if self._pin else tensor
 
 
-class JoinedBatcher:
-    """Callable that copies windows of several stores into batches; rows are numbered store by store.
-
-    Args:
-        batchers: one per store.
-        rows: number of rows of every store.
-    """
-
-    def __init__(self, batchers: Sequence[WindowBatcher], rows: Sequence[int]) -> None:
-        self._batchers, self._starts = batchers, np.cumsum([0, *rows])[:-1]
-
-    def __call__(self, windows: Array) -> Batch:
-        """Return the batch of `windows` (B,), in the order of their stores."""
-        store = self._starts.searchsorted(windows, side="right") - 1
-        numbers = np.unique(store).tolist()
-        parts = [self._batchers[number](windows[store == number] - self._starts[number]) for number in numbers]
-        return parts[0] if len(parts) == 1 else _joined(parts)
-
-    def verify(self) -> None:
-        """Raise a UserError if images differ from their checksums."""
-        for batcher in self._batchers:
-            batcher.verify()
-
-
-def _joined(parts: Sequence[Any]) -> Any:
+def joined(parts: Sequence[Any]) -> Any:
     """Concatenate batches, that is, mappings of tensors, lists and mappings."""
     first = parts[0]
     if isinstance(first, dict):
-        return {name: _joined([part[name] for part in parts]) for name in first}
+        return {name: joined([part[name] for part in parts]) for name in first}
     if isinstance(first, list):
         return [item for part in parts for item in part]
-    joined = torch.cat(list(parts))
-    return joined.pin_memory() if first.is_pinned() else joined
+    whole = torch.cat(list(parts))
+    return whole.pin_memory() if first.is_pinned() else whole

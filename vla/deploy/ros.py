@@ -61,7 +61,7 @@ class RosNetwork:
             if not middleware.startswith(FAST_DDS):
                 raise UserError(
                     f"RMW_IMPLEMENTATION is {middleware}, which ignores the profile of Fast DDS that keeps others out: "
-                    "unset it, or choose deploy/network=localhost or site"
+                    "unset it, or choose deploy.network.reach=localhost or site"
                 )
             os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(profile)
         if self.domain is not None:
@@ -124,7 +124,7 @@ def plain_errors() -> Iterator[None]:
 
 @contextmanager
 def command_node(name: str, network: Reach) -> Iterator[tuple[Any, Event]]:
-    """Run a command as a ROS node on an option of `deploy/network`; user errors exit with one sentence.
+    """Run a command as a ROS node on a part of the network; user errors exit with one sentence.
 
     Yields the node, and the event of `ros`.
     """

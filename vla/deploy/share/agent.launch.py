@@ -20,7 +20,7 @@ def generate_launch_description() -> LaunchDescription:
                 output="screen",
                 arguments=[
                     ["checkpoint=", LaunchConfiguration("checkpoint")],
-                    ["deploy/network=", LaunchConfiguration("network")],
+                    ["deploy.network.reach=", LaunchConfiguration("network")],
                 ],
             ),
         ]

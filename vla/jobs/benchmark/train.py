@@ -66,7 +66,7 @@ class _Stopwatch(lightning.Callback):
 
     def on_train_start(self, trainer: Any, pl_module: lightning.LightningModule) -> None:
         """Verify the demonstrations, which long trainings do once."""
-        trainer.datamodule.make_batch.verify()
+        trainer.datamodule.verify()
 
     def on_train_batch_end(
         self, trainer: Any, pl_module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
