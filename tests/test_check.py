@@ -312,10 +312,7 @@ def test_what_can_no_longer_change_a_policy_is_said_and_its_report_does_not_show
             ("experiment=libero_varied", "model/image=efficientnet_lite0"),
             "; experiment=libero_varied sets it: model.image.channels=VALUE replaces it",
         ),
-        (
-            ("experiment=few", "model=smolvla_tiny"),
-            "; experiment=few chooses it, unless the command does: model/text=OPTION",
-        ),
+        (("experiment=few", "model/text=minilm"), "; experiment=few sets it: ~model.text.dropout removes it"),
         (("experiment=libero", "tokenizer.bins=1"), "tokenizer.bins must be greater than or equal to 2, got 1"),
     ],
 )

@@ -97,9 +97,6 @@ def _of_experiment(config: Mapping[str, Any], error: str) -> str:
     if "." not in key or config.get("checkpoint") is not None:  # which brings that of its own training
         return ""
     for content in _experiments(str(name)):
-        path = key.replace(".", "/")
-        if any(f"override /{path}" in entry for entry in content.get("defaults", ()) if isinstance(entry, dict)):
-            return f"experiment={name} chooses it, unless the command does: {path}=OPTION"
         if at(content, key) not in (ABSENT, {}) and at(content, key) == at(config, key):
             way_out = f"~{key} removes it" if f"{key} is unknown" in error else f"{key}=VALUE replaces it"
             return f"experiment={name} sets it: {way_out}"
