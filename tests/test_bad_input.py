@@ -51,7 +51,7 @@ BAD_INPUT = {
     "-m logger=tensorboard,null": "logger takes the name of an option, as in logger=none",
     "model/image/pretrained=false": "see --help; a value has dots, model.image.pretrained=false",
     "~job": "~job leaves no job: choose another one, job=OPTION",
-    "experiment=[rt1,few]": "experiment=[rt1,few] names several: experiment takes one option",
+    "experiment=[standard,few]": "experiment=[standard,few] names several: experiment takes one option",
     "=3": "=3 has no key: write KEY=3",
     "--resolve": "--resolve goes with --cfg job",
     "task.goal=lift": "got 'lift': an option is chosen with a slash, task/goal=lift",

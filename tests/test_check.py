@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import toy
-from composing import check, composed
+from composing import CONF, check, composed
 from omegaconf import DictConfig, OmegaConf
 from saved_policies import save_policy
 
@@ -321,6 +321,14 @@ def test_what_an_experiment_sets_for_other_options_is_told_from_what_was_typed(
 ) -> None:
     with pytest.raises(ValueError, match=f"{re.escape(end)}$"):
         check(composed(*overrides))
+
+
+def test_an_experiment_that_only_hydra_reads_hides_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment/mine.yaml").write_text("one: &all [1]\nother: *all\n")
+    monkeypatch.setattr("vla.config.check.config_folders", lambda: (CONF, tmp_path))
+    said = problem(**{"chosen.experiment": "mine", "task.bloks": 2})
+    assert said == "task.bloks is unknown, did you mean blocks?"
 
 
 @pytest.mark.parametrize("partial", [True, "false", 1, None, [False]])

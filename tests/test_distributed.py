@@ -122,7 +122,7 @@ def test_what_the_machine_lacks_is_said_before_anything_is_done(
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     on = [] if overrides == ("trainer=fsdp",) else ["trainer.accelerator=cpu"]
-    with pytest.raises(ValueError, match=f"is not available here .*{says}.*: try trainer=auto"):
+    with pytest.raises(ValueError, match=f"is not available here .*{says}.* trainer=auto trainer.accelerator=auto"):
         make_trainer(composed("model=rt1_tiny", *overrides, *on).config, None)
 
 

@@ -88,10 +88,15 @@ def test_chunks_of_another_length_are_refused() -> None:
         TOKENIZER.length(4)
 
 
-DAMAGED: list[dict[str, Any]] = [{"coefficients": None}, {"coefficients": [-(10**400), 1]}, {"bpe": "{"}]
+DAMAGED: list[dict[str, Any]] = [
+    {"coefficients": None},
+    {"coefficients": [-(10**400), 1]},
+    {"coefficients": [-(2**30), 1]},  # the text of a chunk would need characters that there are not
+    {"bpe": "{"},
+]
 
 
-@pytest.mark.parametrize("change", DAMAGED, ids=["coefficients", "size", "byte pairs"])
+@pytest.mark.parametrize("change", DAMAGED, ids=["coefficients", "size", "range", "byte pairs"])
 def test_a_damaged_vocabulary_is_refused(change: dict[str, Any]) -> None:
     tokenizer = Fast(spec=SPEC, bins=1024, scale=10.0, chunk=8)
     with pytest.raises(UserError, match="the tokenizer of the policy cannot be read"):

@@ -8,6 +8,7 @@ import re
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from command_line import SMALL, here
@@ -118,14 +119,23 @@ def test_it_trains_and_is_evaluated_and_saved_like_any_other_model(name: str, ho
     assert (home / name / "policy/model.safetensors").is_file() and list((home / name).rglob("report.json"))
 
 
-def test_a_network_that_reads_the_state_in_the_sentence_needs_it_there() -> None:
+def test_a_network_that_reads_the_state_in_the_sentence_is_trained_without_it_if_asked(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     options = {**part_of("model/pi05", "text", name=None, length=20), "state": False}
     network = partial(make_network, "pi05", vocabulary=WORDS)
     tokenizer = Uniform(spec=SPEC, **defaults_of("tokenizer/uniform"))
-    with pytest.raises(ValueError, match=r"PI05 sees the state in the sentence only: model\.text\.state=true"):
-        VisionLanguageAction(
-            *(network, partial(Prompt, **options)), **defaults_of("model/pi05"), spec=SPEC, tokenizer=tokenizer
-        )
+    model = VisionLanguageAction(
+        *(network, partial(Prompt, **options)), **defaults_of("model/pi05"), spec=SPEC, tokenizer=tokenizer
+    )
+    take_statistics(model)
+    assert not caplog.records  # of a policy that acts
+    model.fit(np.zeros((2, len(SPEC.state)), np.float32), np.zeros((2, len(SPEC.action)), np.float32))
+    assert "PI05 sees the state in the sentence only, and it is not there: model.text.state=true" in caplog.text
+    one = batch_of(model)
+    other = {**one, "state": one["state"] + 1}
+    with torch.no_grad():
+        assert torch.equal(model.predict(one).actions, model.predict(other).actions)
 
 
 def test_what_actions_see_of_a_prompt_does_not_end_with_its_padding(tmp_path: Path) -> None:

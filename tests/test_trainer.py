@@ -148,6 +148,7 @@ def test_it_logs_how_fast_it_is_and_what_it_waits_for(folder: Path, tmp_path: Pa
         (("trainer.max_steps=500", "trainer.accumulate_grad_batches=2"), []),
         (("trainer.max_steps=-1",), ["learner.schedule=cosine has no end"]),
         (("trainer.max_steps=-1", "learner.schedule=constant"), []),
+        (("~learner.warmup_steps",), []),  # as of a learner that has none
     ],
 )
 def test_what_never_happens_in_a_training_is_said(

@@ -237,6 +237,10 @@ def test_what_lerobot_cannot_build_is_not_exported(tmp_path: Path, tokenizer: Pa
         LeRobotPolicyExporter(tmp_path / "published").export(as_policy(model, SPEC))
     with pytest.raises(UserError, match=r"reads a sentence with a tokenizer: train with model\.text\.name"):
         LeRobotPolicyExporter(tmp_path / "published").export(as_policy(make_smolvla(), SPEC))
+    model = make_smolvla(tokenizer)
+    model.text.state = True
+    with pytest.raises(UserError, match=r"smolvla has no state in the sentence: train with model\.text\.state=false"):
+        LeRobotPolicyExporter(tmp_path / "published").export(as_policy(model, SPEC))
     assert not [*tmp_path.iterdir()]
 
 

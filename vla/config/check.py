@@ -107,11 +107,12 @@ def _experiments(name: str) -> Iterator[dict[str, Any]]:
     """Yield the content of an experiment's file, and of those that it extends."""
     files = (folder / "experiment" / f"{name}.yaml" for folder in config_folders())
     if file := next((file for file in files if file.is_file()), None):
-        content = read_yaml(file, dict[str, Any])
-        yield content
-        for other in content.get("defaults", ()):
-            if isinstance(other, str) and other != "_self_":
-                yield from _experiments(other)
+        with suppress(UserError):  # what Hydra reads and this does not, such as aliases: the error itself is told
+            content = read_yaml(file, dict[str, Any])
+            yield content
+            for other in content.get("defaults") or ():
+                if isinstance(other, str) and other != "_self_":
+                    yield from _experiments(other)
 
 
 def _check_group(node: Any, group: Group, may_lack: bool) -> None:

@@ -97,9 +97,9 @@ def warn_of_length(experiment: Experiment) -> None:
             text = "without trainer.max_steps learner.schedule=cosine has no end: the learning rate stays at its peak"
             log.warning(text)
         return
-    if steps <= learner["warmup_steps"]:
+    if steps <= (warmup := learner.get("warmup_steps", 0)):  # a learner of a package may have no such key
         text = "trainer.max_steps=%d ends within learner.warmup_steps=%d: the learning rate does not reach its peak"
-        log.warning(text, steps, learner["warmup_steps"])
+        log.warning(text, steps, warmup)
     if interval > (batches := steps * trainer["accumulate_grad_batches"]):
         text = "trainer.val_check_interval=%d is more than the %d batches: no validation, and the last weights are used"
         log.warning(text, interval, batches)

@@ -125,7 +125,8 @@ def _trainer(node: Mapping[str, Any], **options: Any) -> Trainer:
         if anywhere and chosen.get("devices") == 1:  # no machine lacks that
             raise UserError(f"Lightning refuses the trainer: {error}") from error
         options_text = " ".join(f"trainer.{name}={value}" for name, value in chosen.items())
-        raise UserError(f"{options_text} is not available here ({error}): try trainer=auto") from error
+        every_machine = "trainer=auto trainer.accelerator=auto trainer.devices=1"
+        raise UserError(f"{options_text} is not available here ({error}): try {every_machine}") from error
     return trainer
 
 

@@ -45,8 +45,12 @@ def _are_numbers(column: Column) -> bool:
 
 
 def _are_files(column: Column) -> bool:
-    kinds = {field.name: field.type for field in column.type} if pa.types.is_struct(column.type) else {}
-    return "bytes" in kinds and (pa.types.is_binary(kinds["bytes"]) or pa.types.is_large_binary(kinds["bytes"]))
+    fields = [*column.type] if pa.types.is_struct(column.type) else []
+    kinds = {field.name: field.type for field in fields}
+    if "bytes" not in kinds or len(kinds) < len(fields):  # a cell with two fields of one name cannot be read
+        return False
+    # Null: all images are files beside the tables.
+    return any(holds(kinds["bytes"]) for holds in (pa.types.is_binary, pa.types.is_large_binary, pa.types.is_null))
 
 
 def _within(column: Column, high: float) -> bool:

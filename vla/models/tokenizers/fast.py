@@ -120,8 +120,8 @@ class Fast(ActionTokenizer):
             return
         try:
             self._least, self._most = map(int, state["coefficients"])
-            if not -(2**31) <= self._least <= self._most < 2**31:
-                raise ValueError("its coefficients are no range of numbers of 32 bits")
+            if not (abs(self._least) < 2**31 and 0 <= self._most - self._least < MOST_VALUES):
+                raise ValueError("its coefficients are no range that there are characters for")
             self._set_bpe(Tokenizer.from_str(state["bpe"]))
         except Exception as error:  # tokenizers raises a plain Exception for invalid text
             raise UserError(f"the tokenizer of the policy cannot be read: {str(error)[:200]}") from error

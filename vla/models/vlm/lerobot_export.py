@@ -78,6 +78,11 @@ def _config(model: VisionLanguageAction) -> dict[str, Any]:
         raise UserError(
             f"LeRobot's {network.kind} puts images that are no squares elsewhere: train without model.place"
         )
+    if model.text.state != (in_sentence := not network.state_width):
+        raise UserError(
+            f"LeRobot's {network.kind} has {'the' if in_sentence else 'no'} state in the sentence: train with "
+            f"model.text.state={str(in_sentence).lower()}"
+        )
     own = {"vlm_model_name": _tokenizer(model), "num_steps": model.steps}
     return {
         "type": network.kind,

@@ -9,6 +9,7 @@ copies, P tokens of the prefix.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Literal
 
@@ -29,6 +30,8 @@ from vla.models.vlm.packed_linear import pack
 from vla.models.vlm.prompt import PADDING, WORDS, Prompt
 from vla.models.vlm.trunk import Trunk
 from vla.spec import Spec
+
+log = logging.getLogger(__name__)
 
 SHAPE = 1.5  # first parameter of the beta distribution of times; the second is 1
 MIN_TIME = 0.001  # of training
@@ -62,7 +65,7 @@ class VisionLanguageAction(Model):
 
     Raises:
         UserError: state or actions have too many components, a camera is unknown, the trunk does not fit, the
-            vocabulary is too small for words, the state is nowhere, or `prefix` leaves fewer actions than are executed.
+            vocabulary is too small for words, or `prefix` leaves fewer actions than are executed.
     """
 
     uses_tokens = False
@@ -103,8 +106,6 @@ class VisionLanguageAction(Model):
                 f"model.network.vocabulary={self.network.vocabulary} is less than the {WORDS} words of a prompt "
                 "without a tokenizer: raise it, or give model.text.name"
             )
-        if not (self.network.state_width or self.text.state):
-            raise UserError(f"{type(self.network).__name__} sees the state in the sentence only: model.text.state=true")
         self.add_truth_head(self.network.value_width, auxiliary)
         pack(self.network)
         _require_width("state", len(spec.pose), self.network.state_width or len(spec.pose))
@@ -122,6 +123,9 @@ class VisionLanguageAction(Model):
     def fit(self, states: np.ndarray, actions: np.ndarray) -> None:
         """Normalise by the statistics of (N, P) states and (N, D) actions, unless they are those of the trunk
         (UserError: it has none)."""
+        if not (self.network.state_width or self.text.state):  # as openpi trains π0.5 on LIBERO
+            text = "%s sees the state in the sentence only, and it is not there: model.text.state=true adds it"
+            log.warning(text, type(self.network).__name__)
         if self.statistics == "demonstrations":
             self.state_normalizer.fit(states[:, self.spec.pose], constant=1.0)
             self.action_normalizer.fit(actions)
