@@ -12,10 +12,8 @@ import pytest
 from command_line import SMALL, here
 from composing import check, composed
 
-from vla import run
 from vla.config.build import build
 from vla.config.experiment import plain
-from vla.io.errors import UserError
 from vla.tasks.gl import WORKING_BACKEND
 
 # Line → what its sentence says.
@@ -25,6 +23,8 @@ BAD_INPUT = {
     "trainer.max_steps=many": "trainer.max_steps must be ",
     "checkpoint=nowhere": "there is no policy 'nowhere': name a run",
     "checkpoint=nowhere.ckpt": "only resumes its own training: a policy is a folder",
+    "job=deploy": "job=deploy needs deploy=OPTION",
+    "job=report": "report.runs=[RUN,RUN]",
     "job=deploy deploy=loop": "this deployment needs a trained policy",
     "resume=true": "resume=True is not a path",
     "checkpoint=3": "checkpoint=3 is not a path",
@@ -152,7 +152,7 @@ def test_without_gl_the_error_says_what_to_install(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", ["", "x", "-1"])
-def test_a_rank_that_is_no_number_is_named(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rank_that_is_no_number_is_named(tmp_path: Path, value: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SLURM_PROCID", value)
-    with pytest.raises(UserError, match=f"the environment variable SLURM_PROCID is '{value}', not the number"):
-        run._require_ranks()
+    done = here(tmp_path, "job=report", ok=False)
+    assert f"error: the environment variable SLURM_PROCID is '{value}', not the number" in done.stderr

@@ -94,7 +94,9 @@ def test_every_damaged_line_is_named(tmp_path: Path) -> None:
     for number in (1, 3):
         lines[number] = lines[number].replace(b"colour", b"color")
     path.write_bytes(b"".join(lines))
-    with pytest.raises(ValueError, match=r"line 2 of .*index\.jsonl is damaged: .*; so are the lines 4: keep"):
+    with pytest.raises(
+        ValueError, match=r"line 2 of .* is damaged: it does not fit its checksum; so are the lines 4: keep"
+    ):
         EpisodeStore(tmp_path)
     path.write_bytes(b"#\n#\n")
     with pytest.raises(ValueError, match=r"line 1 of .*so are the lines 2: copy the folder again"):

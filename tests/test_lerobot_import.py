@@ -167,7 +167,7 @@ def test_images_in_tables_are_those_of_the_steps_wherever_the_rows_are(home: Pat
             np.testing.assert_array_equal(after.read(here)[name], before.read(there)[name])
     second = dataset / ROWS.replace("file-000", "file-001")
     pq.write_table(pq.read_table(second).drop_columns([FRONT]), second)
-    with pytest.raises(ValueError, match=rf"file-001\.parquet lacks the columns {FRONT}: correct the dataset"):
+    with pytest.raises(ValueError, match=rf"file-001\.parquet lacks the columns {FRONT}, or has them twice: correct"):
         demonstrations(dataset, ARM_SPEC)
 
 
@@ -467,7 +467,7 @@ REFUSED: list[tuple[Change, str]] = [
     *((cut_off(name), "cannot be read.*copy the dataset again") for name in (ROWS, EPISODES, TASKS)),
     (cut_off(MP4), "cannot be read as a video"),
     (listing, "cannot be read as a video"),
-    (rows(lambda table: table.append_column("action", table["action"])), "has twice the columns action: correct"),
+    (rows(lambda table: table.append_column("action", table["action"])), "the columns action, or has them twice"),
     *((pipe(name), f"{name} is a folder, a pipe or a device, not") for name in (INFO, TASKS, EPISODES, ROWS, MP4)),
     (film(40, 64, 10), r"file-000\.mp4 has images of 64 x 64 pixels, not 16 x 16"),
     (film(80, 16, 20), r"mp4 has 20 images per second, the dataset 10: encode the video again"),

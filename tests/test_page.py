@@ -35,6 +35,7 @@ from vla.rollouts.recorder import RerunRecorder
 from vla.rollouts.recordings import keep_pictures, merge_recordings, shown
 from vla.rollouts.results import Report, Result
 from vla.rollouts.rollout import rollout
+from vla.rollouts.statistics import pooled_interval
 from vla.runs.files import Training
 from vla.runs.folder import read_run, save_config, save_training
 from vla.spec import FIRST_SEED, Episode
@@ -345,7 +346,9 @@ def test_the_page_of_a_sweep_leads_to_every_cell(tmp_path: Path) -> None:
     tabulate(tmp_path)
     markup, told = (tmp_path / "sweep.html").read_text(), text(tmp_path / "sweep.html")
     assert re.findall(r'href="([^"#]*)"', markup) == [f"{n}/report.html" for n in range(3)]
-    assert "bc 87.5 (" in told and markup.count("<svg") == 8
+    trainings = [dict(enumerate(won)) for won in ((True, True, True, True), (True, True, True, False))]
+    low, high = (100 * bound for bound in pooled_interval(trainings))
+    assert f"bc 87.5 ({low:.1f}-{high:.1f})" in told and markup.count("<svg") == 8
 
 
 def test_a_page_holds_no_file_that_is_no_picture(whole: Path, tmp_path: Path) -> None:

@@ -236,17 +236,17 @@ def _require_options(arguments: list[str]) -> None:
     """Refuse values where groups take names of options, and a command without a job, which are tracebacks of Hydra."""
     for argument in arguments:
         name, equals, value = argument.partition("=")
-        group, folders = name.lstrip("+~").partition("@")[0], config_folders()
+        group = name.lstrip("+~").partition("@")[0]
         if argument.startswith("~") and group in ("job", "experiment"):
             raise UserError(f"{argument} leaves no {group}: choose another one, {group}=OPTION")
         if equals and not name:
             raise UserError(f"{argument} has no key: write KEY{argument}")
         if group in ("job", "experiment") and value.startswith("["):
             raise UserError(f"{argument} names several: {group} takes one option")
-        is_group = "/" in group or any((folder / group).is_dir() for folder in folders)
-        if is_group and any(re.fullmatch(r"(?i:null|true|false)|[+-]?\d+(\.\d+)?", each) for each in value.split(",")):
-            none = any((folder / group / "none.yaml").is_file() for folder in folders)
-            hint = f", as in {group}=none" if none else ""
+        folders = [path for folder in config_folders() if (path := folder / group).is_dir()]
+        is_value = any(re.fullmatch(r"(?i:null|true|false)|[+-]?\d+(\.\d+)?", each) for each in value.split(","))
+        if is_value and (folders or "/" in group):
+            hint = f", as in {group}=none" if any((path / "none.yaml").is_file() for path in folders) else ""
             dotted = f"; a value has dots, {group.replace('/', '.')}={value}" if "/" in group else ""
             raise UserError(f"{argument}: {group} takes the name of an option{hint}, see --help{dotted}")
 

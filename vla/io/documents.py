@@ -126,7 +126,7 @@ def resolved(value: Any, name: str) -> Any:
 def read_resolved(path: Path) -> Any:
     """Read the JSON file at `path` as a configuration, see `resolved`.
 
-    There is a UserError also if a key stands twice, or a text has half a character, which could not be written again.
+    There is a UserError also if a key stands twice, or a text has a lone surrogate, which could not be written again.
     """
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

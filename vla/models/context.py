@@ -49,7 +49,6 @@ class Context(nn.Module, ABC):
     history = 1  # T
     length: int  # N
     state_width = 0  # R; 0: the robot state is not given to the head
-    takes_vector = False  # whether the text must be a vector; else it may be tokens
 
     def __init__(self, *, image: Callable[..., ImageEncoder], text_width: int, width: int, spec: Spec) -> None:
         super().__init__()
@@ -125,8 +124,6 @@ class KeypointContext(Context):
         proprioception: use the robot state.
     """
 
-    takes_vector = True
-
     def __init__(self, keypoints: Width, proprioception: bool, **inherited: Inherited) -> None:
         super().__init__(**inherited)
         self.features = KeypointFeatures(keypoints, proprioception, self.make_encoder, self.spec)
@@ -157,8 +154,6 @@ class TokenContext(Context):
         proprioception: add a token of the robot state.
         frames_alone: omit what comes after the frames; the summary is then the mean of the newest frame.
     """
-
-    takes_vector = True
 
     def __init__(
         self,

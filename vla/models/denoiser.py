@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from vla.io.errors import UserError
 from vla.io.types import Inherited, Layers, NonNegative, Steps
 from vla.models.chunking import after_prefix, with_prefix
-from vla.models.layers import Batch, draws, mean_where, transformer_decoder
+from vla.models.layers import Batch, mean_where, random_arguments, transformer_decoder
 from vla.models.model import ContextModel, Prediction
 
 Denoise = Callable[[Tensor, Tensor], Tensor]  # noisy actions (B, k, D) and times → (B, k, D), with a context
@@ -126,7 +126,7 @@ class DenoisingModel(ContextModel):
         action = self.scaled(batch["action"][:, -1]).repeat(self.copies, 1, 1)  # (R·B, k, D)
         context = output["context"].repeat(self.copies, 1, 1)
         padding = output["padding"].repeat(self.copies, 1) if "padding" in output else None
-        how = draws(self.training, action.device)
+        how = random_arguments(self.training, action.device)
         noise = torch.randn(action.shape, **how).to(action)
         uniform = torch.rand(len(action), **how).to(action)
         noisy, time, target = self.corrupt(action, noise, uniform)

@@ -85,7 +85,7 @@ def exact_product(left: Tensor, right: Tensor) -> Tensor:
         return left @ right
 
 
-def draws(training: bool, device: torch.device) -> dict[str, Any]:
+def random_arguments(training: bool, device: torch.device) -> dict[str, Any]:
     """Return arguments for torch's functions of random numbers: outside training they are the same on every device.
 
     In training they are made on the device: it would have to finish its work before it gets a copy.

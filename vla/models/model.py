@@ -258,10 +258,9 @@ class ContextModel(Model):
         self, context: Callable[..., Context], image: Callable[..., ImageEncoder], **inherited: Inherited
     ) -> None:
         super().__init__(**inherited)
+        self.require_vector()
         self.context = context(image=image, text_width=self.text.width, width=self.width, spec=self.spec)
         self.history = self.context.history
-        if self.context.takes_vector:
-            self.require_vector()
 
     def encode(self, batch: Batch) -> Tensor | None:
         """Return tokens of each frame, as `Context.encode`."""

@@ -110,8 +110,7 @@ def require(path: Path, columns: Mapping[str, Kind]) -> None:
     """Raise a UserError unless a file has columns of the expected types; their values are not read."""
     empty = schema_of(path).empty_table()
     if wrong := [name for name in columns if empty.column_names.count(name) != 1]:
-        told = "has twice" if wrong[0] in empty.column_names else "lacks"
-        raise UserError(f"{path} {told} the columns {', '.join(wrong)}: {MEND}")
+        raise UserError(f"{path} lacks the columns {', '.join(wrong)}, or has them twice: {MEND}")
     _require_kinds(path, empty, columns)
 
 

@@ -21,7 +21,7 @@ from torch import Tensor
 from vla.io.errors import UserError
 from vla.io.types import Natural, NonNegative, Shift, Steps, Text
 from vla.models.chunking import after_prefix, require_prefix, with_prefix
-from vla.models.layers import Batch, draws, mean_where, newest
+from vla.models.layers import Batch, mean_where, newest, random_arguments
 from vla.models.model import Model, Prediction
 from vla.models.tokenizers.tokenizer import ActionTokenizer
 from vla.models.vlm.network import FlowNetwork, Prefix
@@ -155,7 +155,7 @@ class VisionLanguageAction(Model):
 
         Outside training they are always the same.
         """
-        how, count = draws(self.training, self.noise.device), self.copies * len(batch["state"])
+        how, count = random_arguments(self.training, self.noise.device), self.copies * len(batch["state"])
         noise = torch.randn(count, *self.noise.shape, **how)
         uniform = torch.rand(count, **how)
         time = MIN_TIME + (1 - MIN_TIME) * uniform ** (1 / SHAPE)  # uniform ** (2 / 3) ~ Beta(1.5, 1)
