@@ -28,7 +28,7 @@ from vla.spec import FIRST_SEED, Array
 
 DOCS = Path(__file__).parent
 RESULTS = DOCS / "results"
-HEIGHT = 2080  # of the page, as far as it is shown [px]
+HEIGHT = 2012  # of the page, as far as it is shown [px]
 STEP = 12  # at which the rollout is shown: about to grasp
 FILM_SIZE, FILM_EPISODES, FILM_PAUSE = 320, 5, 8  # of the moving picture: pixels, episodes, frames after each
 ARM_VIEW, ARM_TARGET, ARM_STEPS = (1.1, -0.75, 0.6), (0.3, 0.0, 0.2), (4, 11, 16, 20)  # of the pictures of arms [m]
