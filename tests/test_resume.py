@@ -117,8 +117,8 @@ def test_a_report_of_older_weights_or_compared_with_an_older_run_is_not_this_one
         file.parent.mkdir()
     asked = plain(composed(f"evaluate.against={other.parent}", f"evaluate.nearest={replayed.parent}"))
     report = Report((Result(1_000_000, "success"), Result(1_000_001, "dropped")))
-    for changed in (policy, other, replayed):
-        for file in (policy, other, replayed):
+    for changed in (other, replayed):
+        for file in (other, replayed):
             file.touch()
         write_report(report, tmp_path / "report.json", str(policy), asked, {"weights": "1"})
         assert cached_success(tmp_path, asked, policy, "1") == 0.5

@@ -258,7 +258,8 @@ def test_a_policy_that_is_replaced_while_it_is_evaluated_gets_no_report(
 def test_a_training_that_cannot_be_resumed_stays_as_it_was(home: Path) -> None:
     run = Path(shutil.copytree(home / "run", home / "refused_run"))
     last = run / "checkpoints/last.ckpt"
-    torch.save({**torch.load(last), "WindowDataModule": {"windows": "others"}}, last)
+    saved = torch.load(last)
+    torch.save({**saved, "WindowDataModule": {**saved["WindowDataModule"], "windows": "others"}}, last)
     names = ("report.json", "report.html", "training.json", "config.yaml", "metrics.csv")
     before = {name: (run / name).read_bytes() for name in names}
     refused = here(home, "resume=refused_run", "output=refused_run", "trainer.max_steps=50", ok=False)

@@ -53,9 +53,7 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     values = _values(saved, REQUIRED_NODES)
     if cfg.job == "evaluate":
         if over := [each for each in parsed if _path(each).partition(".")[0] in OVER]:
-            text = (
-                "%s has no effect on the policy of checkpoint=, which is evaluated as it is; pretrained= trains further"
-            )
+            text = "%s has no effect on the policy of checkpoint=, which is not trained; pretrained= trains it further"
             log.warning(text, ", ".join(str(each.input_line) for each in over))
         parsed = [each for each in parsed if each not in over]  # a report shows the training as it was
         values |= _values(saved, REPORTED)

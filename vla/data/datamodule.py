@@ -180,11 +180,11 @@ class WindowDataModule(LightningDataModule):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Raise a UserError unless demonstrations and batches are those of the resumed training."""
-        batch = self.batch_size * self._place()[1]
-        if (before := state.get("batch", batch)) != batch:
+        before, batch, processes = state["batch"], self.batch_size * self._place()[1], self._place()[1]
+        if before != batch:
             raise UserError(
-                f"the resumed training had batches of {before} windows, and {self._place()[1]} processes have batches "
-                f"of {batch}: train on as many devices as before"
+                f"the resumed training had batches of {before} windows, and {processes} processes have batches of "
+                f"{batch}: train on as many devices as before"
             )
         if state["windows"] != self._digest:
             raise UserError(

@@ -36,8 +36,6 @@ def derive_store(
     config and no seed is missing between the first and the last, the new store equals a collected one, and can grow.
     With `repair` an episode may be damaged: if it is in all sources, it becomes a failed seed. Returns these seeds.
     """
-    if folder.exists():
-        raise UserError(f"{folder} exists already and is left alone: choose another inspect.into")
     for store in stores[1:]:
         store.spec.require(stores[0].spec, f"the episode store {store.folder}", f"{stores[0].folder}")
     chosen = _choose(stores, where or {})
@@ -50,6 +48,8 @@ def derive_store(
     lock = locked(folder.with_name(f".{folder.name}.lock"), busy)
     shutil.rmtree(draft, ignore_errors=True)  # left by a process that was killed
     try:
+        if folder.exists():
+            raise UserError(f"{folder} exists already and is left alone: choose another inspect.into")
         codecs = {store.codec for store in stores}
         codec = Codec("lossless") if len(codecs) > 1 else codecs.pop()  # nothing more is lost
         new = EpisodeStore.create_or_open(draft, stores[0].spec, _config(chosen, stores, where), codec)

@@ -27,7 +27,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from vla.data.fields import Field, Rows, ScatteredRows
-from vla.data.header import Codec, fields_of, is_store, read_header, write_header
+from vla.data.header import RAW, Codec, fields_of, is_store, read_header, write_header
 from vla.data.index import INDEX, REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
 from vla.data.statistics import Statistics
 from vla.io.documents import canonical
@@ -186,7 +186,8 @@ class EpisodeStore:
 
         A UserError if it is larger than the memory: a few compressed bytes can promise any image.
         """
-        if (size := entry.steps * sum(column.size for column in self._columns.values())) > (most := memory()):
+        size = entry.steps * sum(column.size for column in self._columns.values())
+        if self.codec != RAW and size > (most := memory()):
             raise UserError(
                 f"seed {entry.seed} in {self.folder} unpacks to {size / 1e9:.0f} GB, and this machine has "
                 f"{most / 1e9:.0f} GB of memory: leave it out, or read it on a larger machine"

@@ -21,7 +21,8 @@ from vla.spec import IN_DISTRIBUTION
 NAMED = 5  # maximum number of tasks in a title
 ROLLOUTS = "Failures first, of every outcome the first ones; each picture shows a whole episode in five seconds."
 EPISODES = (
-    "Outcomes, lengths, and success over the factors that it depends on most, with 95 % intervals; failures are red."
+    "Outcomes, lengths, and, where only some succeed, success over the factors that it depends on most, with 95 % "
+    "intervals; failures are red."
 )
 WINDOWS = "The newest images of each window, its instruction, and each component of the action within its range."
 

@@ -59,17 +59,16 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | N
     return last, None
 
 
-def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path, weights: str | None) -> float | None:
+def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path, weights: str) -> float | None:
     """Return the success rate of a run's report if it is of the same policy, with the digest `weights`, and the same
     evaluation."""
     report = read_report(folder)
-    if report is None or report.checkpoint != str(checkpoint) or report.weights not in (None, weights):
+    if report is None or report.checkpoint != str(checkpoint) or report.weights != weights:
         return None
     against, nearest = config["evaluate"]["against"], config["evaluate"]["nearest"]
-    # Since the report the training may have continued, the run that it compares with have been evaluated again, or
-    # more demonstrations been collected.
-    newer = [checkpoint, *([Path(against) / REPORT] if against else []), *([Path(nearest) / INDEX] if nearest else [])]
-    if (folder / REPORT).stat().st_mtime < max(path.stat().st_mtime for path in newer):
+    # The run that it compares with may have been evaluated again since, or more demonstrations been collected.
+    newer = [*([Path(against) / REPORT] if against else []), *([Path(nearest) / INDEX] if nearest else [])]
+    if any(path.stat().st_mtime > (folder / REPORT).stat().st_mtime for path in newer):
         return None
     if any(part.errors for part in report.reports.values()) or differences(report.config, config):
         return None
