@@ -38,7 +38,7 @@ SCENES, SCENE_SIZE = 3, 200  # of the picture of both renderers: scenes, edge of
 # background read on a light and on a dark page.
 BLUE, GREEN, ORANGE, GREY = "#3b6fb5", "#2f855a", "#b7621b", "#808890"
 PARTS = (
-    (0, 3, BLUE, "world", "task=tabletop,\nmetaworld, gymnasium"),
+    (0, 3, BLUE, "world", "task=tabletop, libero,\nmetaworld, gymnasium"),
     (0, 1, BLUE, "recordings", "task=recorded: LeRobot\ndatasets, ROS 2 bags"),
     (1, 3, BLUE, "expert", "expert=waypoint: a script\nthat acts and labels"),
     (1, 1, GREEN, "demonstrations", "job=collect: verified,\nshared by all runs"),
