@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -73,17 +74,21 @@ def test_the_step_is_named_whose_loss_was_the_first_that_was_not_finite(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1.ckpt", "2.ckpt"]
 
 
-def test_training_leaves_no_setting_behind_that_changes_what_a_policy_computes() -> None:
+@pytest.mark.parametrize("fails", [False, True])
+def test_training_leaves_no_setting_behind_that_changes_what_a_policy_computes(fails: bool) -> None:
     flash = torch.backends.cuda.flash_sdp_enabled
     during = []
 
     class Watch(lightning.Callback):
         def on_train_batch_start(self, *arguments: Any) -> None:
             during.append(flash())
+            if fails:
+                raise RuntimeError("as a loss that is not finite in a cell of a sweep")
 
     torch.backends.cuda.enable_flash_sdp(True)
     learner = make_learner()
-    make_trainer(1, Watch()).fit(learner, loader(learner, [make_batch(1)]))
+    with pytest.raises(RuntimeError, match="not finite") if fails else nullcontext():
+        make_trainer(1, Watch()).fit(learner, loader(learner, [make_batch(1)]))
     assert during == [False] and flash()
 
 

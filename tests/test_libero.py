@@ -144,6 +144,21 @@ def test_a_coloured_start_leaves_the_official_ones_as_they_are() -> None:
         assert not coloured.draws["start"]["coloured"]
 
 
+def test_one_share_of_drawn_starts_changes_nothing_else() -> None:
+    shares = ([], ["task.randomize.colours=0.5"], ["task.randomize.places=0.5"])
+    worlds, happened = [world("task.suite=spatial", "task.tasks=[0]", *share) for share in shares], set()
+    for seed in range(6):
+        starts = []
+        for one in worlds:
+            with one.blind():
+                starts.append((one.reset(seed).truth or {})["positions"])
+        coloured, exchanged = worlds[1].draws["start"]["coloured"], worlds[2].draws["start"]["exchanged"]
+        assert np.array_equal(starts[0], starts[1])
+        assert np.array_equal(starts[0], starts[2]) == (not exchanged)
+        happened |= {("coloured", coloured), ("exchanged", exchanged)}
+    assert len(happened) == 4
+
+
 def test_all_suites_have_ten_tasks_and_sentences() -> None:
     assert len(set(world().tasks)) == len({task.instruction for suite in SUITES for task in tasks_of(suite)}) == 40
     assert world("task.suite=[goal,long]", "task.tasks=[1,2]").tasks == ("goal_1", "goal_2", "long_1", "long_2")
@@ -161,6 +176,14 @@ def test_a_scene_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         scene.save_model(first, tmp_path / "half.mjb")
     monkeypatch.setattr(scene, "_light", None)
     assert np.array_equal(first.body_mass, scene.load_scene(name, (), None).body_mass)
+
+
+def test_the_order_of_meshes_in_a_scene_is_the_same_in_every_process() -> None:
+    task, detail = tasks_of("goal")[7], scene.Detail(things=300, robot=300, rest=100, texels=32)
+    model = scene._light(package.scene_xml(task.scene), ("flat_stove_1",), detail)
+    names = [model.mesh(number).name for number in range(model.nmesh)]
+    thinned = [name.removesuffix("_light") for name in names if name.endswith("_light")]
+    assert len(thinned) > 20 and thinned == sorted(thinned)
 
 
 def test_pictures_are_mirrored_as_published() -> None:

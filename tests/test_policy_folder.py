@@ -69,6 +69,13 @@ def test_what_modules_keep_besides_weights_is_in_the_file_of_the_weights(tmp_pat
     assert read_policy(tmp_path).state == within
 
 
+def test_equal_policies_have_the_same_digest(tmp_path: Path) -> None:
+    further = {f"{part}._extra_state": {"name": f'"ä" {part}'} for part in ("text", "tokenizer", "ähnlich", "x")}
+    folders = [save_policy(tmp_path / str(number), CONFIG, state=further | {"x": torch.ones(1)}) for number in range(6)]
+    assert len({read_policy(folder).training.weights for folder in folders}) == 1
+    assert read_policy(folders[0]).state == further | {"x": torch.ones(1)}
+
+
 def test_what_is_no_policy_is_said_with_what_would_be_one(tmp_path: Path) -> None:
     run = tmp_path / "run"
     (run / "checkpoints").mkdir(parents=True)
@@ -251,7 +258,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
         "does not fit the model",
     ),
     "a state of no module": (
-        resized(lambda header: header.update(__metadata__={"text._extra_state": "{"})),
+        resized(lambda header: header.update(__metadata__={"state": "{"})),
         "is damaged: ",
     ),
 }

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from typing import Any, Literal
 
 import torch
-from lightning import LightningModule
+from lightning import Callback, LightningModule, Trainer
 from torch import Tensor, distributed, nn
 from torchmetrics import MeanMetric
 
@@ -112,6 +112,10 @@ class Learner(LightningModule):
         if self._before is not None:
             _set_precision(*self._before)
             self._before = None
+
+    def configure_callbacks(self) -> list[Callback]:
+        """Return the callback that also undoes it after an error."""
+        return [_TearDown()]
 
     @contextmanager
     def evaluating(self) -> Iterator[None]:
@@ -229,6 +233,14 @@ class Learner(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restore the figures of the last validation, for a policy that is saved before the next one."""
         self._figures = checkpoint["figures"]
+
+
+class _TearDown(Callback):
+    """Calls `teardown` where a training ends in an error, after which Lightning does not, but a sweep goes on."""
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Undo what the training set."""
+        pl_module.teardown("fit")
 
 
 def _set_precision(flash: bool, precision: str) -> None:

@@ -29,6 +29,7 @@ from vla.spec import Spec
 
 POLICY, BEST = "policy", "policy_best"  # in the folder of a run: its policy, and the best one in validation
 CONFIG, SPEC, WEIGHTS, TRAINING, CARD = "config.json", "spec.json", "model.safetensors", "training.json", "README.md"
+FURTHER = "state"  # of modules that is no tensor, as JSON, in the metadata of the weights
 REQUIRED_NODES = ("task", "tokenizer", "model")  # of the config
 OPTIONAL_NODES = ("policy", "chosen", "expert", "collect", "data", "learner", "trainer", "validate")
 TRUTH_MODULES = ("truth_head", "truth_scale")  # modules of a model used in training only
@@ -77,9 +78,8 @@ class SavedPolicy:
                 raise UserError(f"{path} is damaged, or not the file that {TRAINING} describes: copy the folder again")
         with opened(path) as weights:
             names: list[str] = weights.keys()  # it is no mapping
-            further = (weights.metadata() or {}).items()
-            plain: dict[str, Any] = {name: parse_json(text, Any, name) for name, text in further}  # type: ignore[arg-type]
-            return plain | {name: weights.get_tensor(name) for name in names}
+            further = parse_json((weights.metadata() or {}).get(FURTHER, "{}"), dict[str, Any], str(path))
+            return further | {name: weights.get_tensor(name) for name in names}
 
     def initialize(self, model: Model) -> None:
         """Load the weights for fine-tuning, as `restore`; the truth head keeps its own if the truth differs."""

@@ -66,7 +66,9 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
         for name, value in state.items()
         if isinstance(value, Tensor)
     }
-    weights = save(tensors, {name: json.dumps(value) for name, value in state.items() if name not in tensors})
+    # One text: the library writes several in an order that it draws anew, and equal policies have the same digest.
+    further = json.dumps({name: value for name, value in state.items() if name not in tensors})
+    weights = save(tensors, {files.FURTHER: further})
     training = files.Training(
         steps=content["global_step"],
         windows=next((part["windows"] for part in states if isinstance(part.get("windows"), str)), ""),

@@ -10,7 +10,7 @@ import numpy as np
 from annotated_types import Ge, Le, MinLen, Predicate
 
 from vla.io.errors import UserError
-from vla.io.types import ImageSize, Names, Natural, Share, unique
+from vla.io.types import ImageSize, Names, Natural, unique
 from vla.spec import FIRST_SEED, Array, Observation, Spec
 from vla.tasks.libero.controller import REACH, Controller
 from vla.tasks.libero.goal import Goal
@@ -115,15 +115,16 @@ class Libero(ManyTasks):
         turn = (seed - FIRST_SEED) // len(self._tasks)
         fixed = self._starts_of == "official" or (self._starts_of == "by_seed" and seed >= FIRST_SEED)
         state = turn % len(starts) if fixed else None
-        random = np.random.default_rng(seed)
-        exchanged = state is None and _happens(self._randomize.places, random)
-        coloured = state is None and _happens(self._randomize.colours, random)
+        # Each its own, so that one share changes nothing but what it is of.
+        random, places, colours = (np.random.default_rng(key) for key in (seed, [seed, 4], [seed, 5]))
+        exchanged = state is None and places.random() < self._randomize.places
+        coloured = state is None and colours.random() < self._randomize.colours
         start = starts.drawn(random, exchanged) if state is None else starts.official(state)
         self.draws = {
             "start": {"official": -1 if state is None else state, "exchanged": exchanged, "coloured": coloured}
         }
         set_start(scene.model, scene.data, start)
-        scene.colour(random if coloured else None)
+        scene.colour(colours if coloured else None)
         scene.controller.reset()
         for _ in range(self._settle):
             scene.controller.step(scene.data, WAIT)
@@ -252,11 +253,6 @@ def _materials(model: mujoco.MjModel, task: Task) -> list[list[int]]:
 def _things(task: Task) -> set[str]:
     """Return the names of the movable things in a scene."""
     return {part[1] for part in task.initial if part[0] in ("on", "in")} - task.fixtures.keys()
-
-
-def _happens(share: Share, random: np.random.Generator) -> bool:
-    """Draw whether this start is in a share of all starts; a share of 0 takes no random number."""
-    return share > 0 and bool(random.random() < share)
 
 
 def command_of(action: Array) -> Array:

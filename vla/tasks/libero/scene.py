@@ -88,7 +88,7 @@ def _light(xml: str, things: Collection[str], detail: Detail | None) -> mujoco.M
     full, spec = mujoco.MjSpec.from_string(xml).compile(), mujoco.MjSpec.from_string(xml)
     meshes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_MESH]
     solid = {geom.meshname for geom in meshes if geom.contype or geom.conaffinity}
-    for name in {geom.meshname for geom in meshes} - solid:
+    for name in sorted({geom.meshname for geom in meshes} - solid):  # the order of a set differs between processes
         most = detail.rest
         if name.startswith(("robot0_", "gripper0_")):
             most = detail.robot
