@@ -19,6 +19,7 @@ from vla.config.experiment import Experiment
 from vla.jobs.evaluate import require_possible
 from vla.parallel.pool import Cluster, Crashed
 from vla.reports.evaluation import summary, write_report
+from vla.rollouts import recordings
 from vla.rollouts.evaluate import _RolloutWorker, evaluate
 from vla.rollouts.recordings import chosen, keep_pictures, merge_recordings
 from vla.rollouts.results import Report, Result
@@ -248,7 +249,7 @@ def test_recordings_are_kept_in_one_file_failures_first(tmp_path: Path) -> None:
     kept = [entry.recording_id.rpartition("-")[0] for entry in RrdReader(target).recordings()]
     assert kept == ["failure-01000003-timeout", "success-01000000", "success-01000001"]
     assert merge_recordings(report, folder, target, 3) == [SEEDS[3], SEEDS[0], SEEDS[1]]  # as after a lost report
-    keep_pictures(report, folder, 3)
+    keep_pictures(report, folder, 3, SEEDS)
     assert list(tmp_path.iterdir()) == [target]
 
 
@@ -302,3 +303,20 @@ def test_what_ends_differently_when_played_again_has_no_recording(
     report = evaluate(Fickle, toy.make_agent, toy.make_recorder(tmp_path), SEEDS[:2], recordings=2)
     assert report.successes == 2 and "seed 1000000 has no recording" in caplog.text
     assert merge_recordings(report, tmp_path, tmp_path / "rollouts.rrd", 2) == []
+
+
+@pytest.mark.parametrize("limit", ["MOST", "LARGEST"])
+def test_what_would_be_too_large_in_one_file_stays_in_several(
+    limit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, target = tmp_path / "recordings", tmp_path / "rollouts.rrd"
+    report = evaluate(toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS[:5])
+    sizes = {file.name: file.stat().st_size for file in folder.iterdir()}
+    two = sizes["failure-01000003-timeout.rrd"] + sizes["success-01000000.rrd"]
+    monkeypatch.setattr(recordings, limit, 2 if limit == "MOST" else two)
+    with caplog.at_level("INFO", "vla.rollouts.recordings"):
+        merged = merge_recordings(report, folder, target, "all")
+    assert merged == [SEEDS[3], SEEDS[0]] and len(RrdReader(target).recordings()) == 2
+    assert f"{target} has 2 recordings, the 3 others stay in {folder}" in caplog.text
+    keep_pictures(report, folder, "all", merged)
+    assert sorted(path.name for path in folder.iterdir()) == [f"success-{SEEDS[n]:08d}.rrd" for n in (1, 2, 4)]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vla.io.files import atomic_path, writing
+from vla.io.files import atomic_path, remove_drafts, writing
 
 
 def test_a_file_and_a_folder_take_their_place_at_the_end(tmp_path: Path) -> None:
@@ -52,3 +52,13 @@ def test_only_what_a_disk_says_is_put_in_other_words(tmp_path: Path) -> None:
         raise OSError(ENOENT, os.strerror(ENOENT), "other")
     with pytest.raises(OSError, match="inner cannot be written"), writing(tmp_path / "outer"), writing(Path("inner")):
         raise OSError(ENOSPC, os.strerror(ENOSPC))
+
+
+def test_what_killed_processes_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    others = ["last.ckpt", "policy", ".training", ".0123abcd.other.ckpt", ".0123abcd.policy.before"]
+    for name in (*others, ".0123abcd.last.ckpt", ".0123abcd.policy"):
+        if "policy" in name:
+            (tmp_path / name).mkdir()
+        (tmp_path / name / "model" if "policy" in name else tmp_path / name).touch()
+    remove_drafts(tmp_path / "last.ckpt", tmp_path / "policy", tmp_path / "missing" / "policy")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)

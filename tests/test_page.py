@@ -62,8 +62,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     environment, recorder = make_environment(), RerunRecorder(folder / "recordings", pictures=6)
     episodes = [rollout(environment, ThinkingAgent(), seed, recorder) for seed in SEEN]
     report = Report(tuple(Result(each.seed, each.outcome, each.instruction) for each in episodes))
-    merge_recordings(report, folder / "recordings", folder / "rollouts.rrd", "all")
-    keep_pictures(report, folder / "recordings", "all")
+    recorded = merge_recordings(report, folder / "recordings", folder / "rollouts.rrd", "all")
+    keep_pictures(report, folder / "recordings", "all", recorded)
     first = [episode.observations[0] for episode in episodes]
     batch: dict[str, Any] = {
         "rgb": {name: np.stack([seen.rgb[name] for seen in first])[:, None] for name in first[0].rgb},

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from psutil import Process
 from rerun.chunk import RrdReader
 from toy_recordable import ThinkingAgent, make_environment
 
@@ -127,3 +128,12 @@ def test_colours_beyond_the_range_are_clipped() -> None:
     rgba = np.array([-0.2, 1.25, 0.5, 1])
     shape = Shape("table", "top", "box", np.zeros(3), np.array([1.0, 0, 0, 0]), np.ones(3), rgba)
     assert recorder._solid(shape).colors.as_arrow_array().to_pylist() == [0x00FF80FF]
+
+
+def test_recordings_leave_no_threads_behind(tmp_path: Path) -> None:
+    recorder, environment, agent = RerunRecorder(tmp_path, pictures=0), make_environment(), ThinkingAgent()
+    threads = []
+    for seed in range(SUCCESS, SUCCESS + 3):
+        rollout(environment, agent, seed, recorder)
+        threads.append(Process().num_threads())
+    assert len(set(threads)) == 1

@@ -3,6 +3,7 @@ are started, killed or interrupted."""
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import re
@@ -33,6 +34,7 @@ from vla import jobs
 from vla.data.episodes import EpisodeStore
 from vla.io.array_messages import pack
 from vla.jobs import evaluate
+from vla.models.learner import Learner
 from vla.models.policy_folder import read_policy
 from vla.rollouts.results import recording_name
 from vla.tasks.rendering.fast import Fast
@@ -41,7 +43,10 @@ from vla.tasks.rendering.reference import Reference
 
 def test_the_key_of_a_server_is_in_no_file_of_a_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VLA_API_KEY", "s3cret")
+    gc.collect()
+    before = sum(isinstance(each, Learner) for each in gc.get_objects())
     here(tmp_path, "job=train", "model=bc", "deploy=server", *SMALL, "output=run")
+    assert sum(isinstance(each, Learner) for each in gc.get_objects()) == before  # there is room for what follows
     files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
     assert tmp_path / "run/checkpoints/last.ckpt" in files
     assert not [path for path in files if b"s3cret" in path.read_bytes()]

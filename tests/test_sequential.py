@@ -125,7 +125,7 @@ def test_recordings_of_episodes_that_do_not_count_are_removed(tmp_path: Path) ->
     )
     recorded = merge_recordings(report, folder, tmp_path / "rollouts.rrd", "all")
     assert sorted(recorded) == [each.seed for each in report.results]
-    keep_pictures(report, folder, "all")
+    keep_pictures(report, folder, "all", recorded)
     assert [path.name for path in tmp_path.iterdir()] == ["rollouts.rrd"]
 
 

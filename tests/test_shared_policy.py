@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -20,7 +21,7 @@ from vla.models.model import Model
 from vla.parallel.pool import Cluster
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.rollout import rollout
-from vla.rollouts.shared_policy import shared_policy
+from vla.rollouts.shared_policy import _accept, shared_policy
 from vla.spec import FIRST_SEED, Observation
 
 MODELS: dict[str, Callable[[], Model]] = {
@@ -99,3 +100,19 @@ def test_an_error_that_cannot_be_sent_is_told() -> None:
     refused = pytest.raises(RuntimeError, match="Odd: no idea")
     with shared_policy(lambda: policy) as make_agent, closing(make_agent(ToyEnvironment())) as agent, refused:
         agent.act(SPEC.random_observation(np.random.default_rng(0)))
+
+
+def test_the_lane_of_a_worker_that_has_left_is_the_next_ones() -> None:
+    lanes, talks = list[int](), list[Future[None]]()
+
+    def begin(lane: int, connection: Any, spec: Any) -> Future[None]:
+        lanes.append(lane)
+        talks.append(Future())
+        if len(talks) == 2:
+            talks[0].set_result(None)
+        return talks[-1]
+
+    listener = Mock()
+    listener.accept().recv.side_effect = [SPEC] * 4 + [None]
+    _accept(listener, begin)
+    assert lanes == [0, 1, 0, 2]

@@ -10,9 +10,13 @@ from typing import Any
 
 import pytest
 from figures import panels, points, spans, texts
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.types import RunMode
 from matplotlib.figure import Figure
+from omegaconf import OmegaConf
 from rich.console import Console
 
+from vla.jobs.sweep import SweepTable
 from vla.reports.comparison import Compared, common_episodes, compare
 from vla.reports.comparison_page import results_table, tabulate
 from vla.reports.evaluation import write_report
@@ -116,6 +120,24 @@ def test_cells_that_failed_are_left_out_and_a_sweep_without_any_writes_nothing(t
     failed = "2 model=rt1: holds a training that differs in model"
     assert (tmp_path / "sweep.md").read_text().endswith(f"\n\n- failed: {failed}\n")
     assert f"<dd>{failed}</dd>" in (tmp_path / "sweep.html").read_text()
+
+
+def test_of_many_cells_the_table_is_written_after_some_and_at_the_end(tmp_path: Path) -> None:
+    written, page = [], tmp_path / "sweep.html"
+    for number in range(13):
+        cell(tmp_path, number, [f"seed={number}"], 9)
+        hydra = {
+            "mode": RunMode.MULTIRUN,
+            "runtime": {"output_dir": str(tmp_path / str(number))},
+            "sweep": {"dir": str(tmp_path)},
+        }
+        config = OmegaConf.create({"hydra": hydra})
+        SweepTable().on_job_end(config, JobReturn(status=JobStatus.COMPLETED))
+        written.append(page.exists())
+        page.unlink(missing_ok=True)
+    assert written == [True] * 10 + [False] * 3
+    SweepTable().on_multirun_end(config)
+    assert page.exists()
 
 
 def test_agents_without_a_model_are_rows_too(tmp_path: Path) -> None:

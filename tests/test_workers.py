@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from collecting import until
+from psutil import Process
 
 from vla.io.errors import UserError
 from vla.parallel.pool import Crashed, ProcessPool
@@ -103,3 +104,12 @@ def test_a_process_that_cannot_start_says_why(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setitem(sys.modules, "only_here", only_here)
     (missing,) = results(only_here.Doubling, 1)
     assert isinstance(missing, ModuleNotFoundError) and "only_here" in str(missing)
+
+
+def test_processes_that_crash_leave_no_file_open() -> None:
+    open_files = list[int]()
+    with ProcessPool(Doubling, 1) as pool:
+        for number in (1, 7, 1, 7, 1):
+            pool.submit(number).exception()
+            open_files.append(Process().num_fds())
+    assert open_files[0] == open_files[2] == open_files[4]

@@ -74,8 +74,9 @@ def _choose(stores: Sequence[EpisodeStore], where: Mapping[str, Any]) -> Chosen:
     chosen: Chosen = {}
     for store in stores:
         for config, entries in entries_by_config(store):
+            key = json.dumps(config)
             for entry in filter(matches, entries):
-                chosen.setdefault(json.dumps(config), {}).setdefault(entry.seed, []).append((store, entry))
+                chosen.setdefault(key, {}).setdefault(entry.seed, []).append((store, entry))
     return chosen
 
 

@@ -53,6 +53,15 @@ def atomic_path(target: Path) -> Iterator[Path]:
             draft.unlink()
 
 
+def remove_drafts(*targets: Path) -> None:
+    """Remove what killed processes left of `atomic_path`; no other process may write these targets meanwhile."""
+    for target in targets:
+        for draft in target.parent.glob(f".{'[0-9a-f]' * 8}.{target.name}"):
+            shutil.rmtree(draft, ignore_errors=True)
+            with suppress(OSError):  # it was a folder
+                draft.unlink()
+
+
 def write_text(target: Path, text: str) -> None:
     """Write a text file atomically, creating its folder; see `atomic_path`."""
     with atomic_path(target) as draft:
@@ -62,7 +71,11 @@ def write_text(target: Path, text: str) -> None:
 
 def write_json(target: Path, content: object) -> None:
     """Write strict JSON atomically, creating its folder; see `atomic_path`."""
-    write_text(target, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    with atomic_path(target) as draft:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with draft.open("w", encoding="utf-8") as file:  # piece by piece: as a text it would take eight times its size
+            json.dump(content, file, indent=1, allow_nan=False, ensure_ascii=False)
+            file.write("\n")
 
 
 def require_file(path: Path) -> None:

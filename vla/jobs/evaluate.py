@@ -310,7 +310,7 @@ def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, R
     write_report(report, output / REPORT, used, experiment.config, facts, others, compared)
     if "recorded" in facts:  # only now: without a report the same command merges them again
         with warn_on_error(output / RECORDINGS):
-            keep_pictures(report, output / RECORDINGS, wanted.recordings)
+            keep_pictures(report, output / RECORDINGS, wanted.recordings, {*facts["recorded"]})
     page = None
     with warn_on_error(output / PAGE):
         page = write_page(output)

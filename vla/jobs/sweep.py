@@ -1,4 +1,4 @@
-"""The Hydra callback that tabulates a sweep after every cell."""
+"""The Hydra callback that tabulates a sweep."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ from omegaconf import DictConfig
 
 from vla.io.printable import show
 
+LOCK = ".lock"  # in the folder of a sweep
+EVERY = 10  # cells between two tables once there are so many, because a table reads all of them
+
 
 class SweepTable(Callback):
-    """Writes `sweep.html`, `sweep.md` and `sweep.png` after every cell."""
+    """Writes `sweep.html`, `sweep.md` and `sweep.png` after the first cells, then after some, and at the end."""
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Remove an earlier error of the cell."""
@@ -28,26 +31,31 @@ class SweepTable(Callback):
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Write the table of all cells that have a report."""
         if config.hydra.mode == RunMode.MULTIRUN:
-            from vla.runs.sweep import FAILURE
+            from vla.runs.folder import REPORT
+            from vla.runs.sweep import FAILURE, cells
 
             if job_return.status == JobStatus.COMPLETED:  # from a concurrent sweep in this folder
                 (Path(config.hydra.runtime.output_dir) / FAILURE).unlink(missing_ok=True)
             from vla.reports.comparison_page import tabulate  # imports matplotlib
 
             folder = Path(config.hydra.sweep.dir)
-            with FileLock(folder / ".lock"):  # the last holder of the lock writes all cells
-                tabulate(folder)
+            with FileLock(folder / LOCK):  # the last holder of the lock writes all cells
+                ended = len({*cells(folder, REPORT), *cells(folder, FAILURE)})
+                if ended <= EVERY or ended % EVERY == 0:
+                    tabulate(folder)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Print the table of the sweep, and name its page; end the process with an error if there are no cells."""
-        from vla.reports.comparison_page import SWEEP, results_table  # imports matplotlib
-        from vla.runs.sweep import OVERRIDES, cells, read_rows
+        from vla.reports.comparison_page import SWEEP, results_table, tabulate  # imports matplotlib
+        from vla.runs.sweep import OVERRIDES, cells
 
         folder = Path(config.hydra.sweep.dir)
         if not (folder.is_dir() and cells(folder, OVERRIDES)):
             print("error: the sweep has no cells: one of its ranges or choices is empty", file=sys.stderr)
             sys.exit(1)
-        if rows := read_rows(folder):
+        with FileLock(folder / LOCK):
+            rows = tabulate(folder)
+        if rows:
             show(results_table(rows))
         if (page := folder / SWEEP).exists():
             print(f"wrote {page}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import shutil
 from collections.abc import Iterator
@@ -17,12 +18,12 @@ from vla.config.experiment import Experiment, training_policy
 from vla.data.datamodule import WindowDataModule
 from vla.data.episodes import EpisodeStore
 from vla.io.errors import UserError
-from vla.io.files import atomic_path, warn_on_error, writing
+from vla.io.files import atomic_path, remove_drafts, warn_on_error, writing
 from vla.jobs.collect import demonstration_spec, demonstrations
 from vla.models.diffusion import Diffusion
 from vla.models.learner import Learner
 from vla.models.model import Model
-from vla.models.policy_folder import POLICY
+from vla.models.policy_folder import BEST, POLICY
 from vla.models.tokenizers.tokenizer import out_of_bounds, rounding
 from vla.models.trunk import is_within, trunks
 from vla.parallel.limits import cores
@@ -65,10 +66,23 @@ def train(experiment: Experiment) -> Path | None:
     last, chosen = training_progress(output, experiment.config)
     if chosen is not None:
         return chosen if first_process() else None
+    first = _trained(experiment, last)
+    gc.collect()  # cycles keep the trainer and the model, for whose memory a next training or an evaluation has a use
+    if not first:
+        return None
+    log.info("the policy is %s", output / POLICY)
+    return output / POLICY
+
+
+def _trained(experiment: Experiment, last: Path | None) -> bool:
+    """Train, from a `last` checkpoint if there is one; return whether this is the first process."""
     quiet_lightning()
+    output = experiment.output
     graceful_stop, closed_loop = GracefulStop(output / CHECKPOINTS), _closed_loop(experiment)
     warn_of_length(experiment)
     with closed_loop or nullcontext(), training_lock(output / CHECKPOINTS):
+        if first_process():
+            remove_drafts(output / CHECKPOINTS / LAST, output / POLICY, output / BEST)
         # Before collection, so that missing devices are reported early.
         callbacks = [
             Estimate(experiment.config),
@@ -82,10 +96,7 @@ def train(experiment: Experiment) -> Path | None:
         _fit(experiment, last, trainer, graceful_stop)
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()  # together: at their exit the others would wait for the first one
-        if not trainer.is_global_zero:
-            return None
-    log.info("the policy is %s", output / POLICY)
-    return output / POLICY
+        return trainer.is_global_zero
 
 
 def warn_of_length(experiment: Experiment) -> None:

@@ -146,16 +146,30 @@ class ProcessPool:
 
     def _attempt(self, item: Any) -> Any:
         try:
-            return self._process().ask(item)
+            return self._ask(item)
         except ProcessEnded as end:
             if not self._closed:
                 log.warning("a worker process crashed (%s); trying again", end)
-        self._own.process = None
         try:
-            return self._process().ask(item)
+            return self._ask(item)
         except ProcessEnded as end:
-            self._own.process = None
             raise Crashed(f"a worker process crashed twice: {end}; cluster.workers=1 shows the traceback") from end
+
+    def _ask(self, item: Any) -> Any:
+        process = self._process()
+        try:
+            return process.ask(item)
+        except ProcessEnded:
+            self._own.process = None
+            self._forget(process)
+            raise
+
+    def _forget(self, process: WorkerProcess) -> None:
+        """Free what is open of a process that has ended; a pool that is left does so for all."""
+        with self._lock:
+            if not self._closed:
+                self._processes.remove(process)
+                process.release()
 
     def _process(self) -> WorkerProcess:
         """Return the process of this thread, started and with its worker created."""
@@ -168,7 +182,9 @@ class ProcessPool:
             try:
                 process.answer()
             except ProcessEnded as end:
-                if process.killed:
+                killed = process.killed
+                self._forget(process)
+                if killed:
                     raise
                 raise UserError(
                     f"a worker process could not start: {end}, see its output, or run with cluster.workers=1"

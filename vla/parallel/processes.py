@@ -92,6 +92,11 @@ class WorkerProcess:
         """Wait up to `SECONDS_TO_END` for the end of the process."""
         self._process.join(SECONDS_TO_END)
 
+    def release(self) -> None:
+        """Close the files of a process that has ended."""
+        self._connection.close()
+        self._process.close()
+
     def kill(self) -> None:
         """End the process at once, if it has not ended."""
         self._process.kill()

@@ -21,6 +21,7 @@ from vla.reports.factors import numeric
 from vla.reports.observations import reset_panels, spans
 from vla.reports.pictures import BLUE, GREEN, RED, Panels, plot_counts, save
 from vla.reports.tables import Table, in_brackets
+from vla.spec import Array
 
 WORDS = 12  # maximum number of bars for words and for instructions
 FRAMES, COLUMNS = 4, 4  # episodes whose first images are shown, panels per row
@@ -98,8 +99,8 @@ def _panels(findings: StoreReport) -> Panels:
     panels["length of episodes [steps]"] = partial(_plot_values, values=[entry.steps for entry in entries])
     panels["instructions"] = partial(_plot_values, values=[entry.instruction for entry in entries])
     for index, name in enumerate(spec.action):
-        labels = findings.actions[:, index].tolist()
-        panels[name + in_brackets(spec.units[index])] = partial(_plot_values, values=labels, log=True)
+        labels = findings.actions[:, index]
+        panels[name + in_brackets(spec.units[index])] = partial(_plot_numbers, values=labels, log=True)
     drawn: dict[str, list[Any]] = {}
     for entry in entries:
         for name, value in flat(entry.draws).items():
@@ -109,8 +110,8 @@ def _panels(findings: StoreReport) -> Panels:
     return panels | {name: partial(_plot_values, values=values) for name, values in shown_draws}
 
 
-def _plot_values(axes: Axes, values: Sequence[Any], log: bool = False) -> None:
-    """Plot counts of words, a scatter plot of pairs, or a histogram of all else, perhaps with a logarithmic axis."""
+def _plot_values(axes: Axes, values: Sequence[Any]) -> None:
+    """Plot counts of words, a scatter plot of pairs, or a histogram of all else."""
     items = leaves(values)
     if not numeric(items):
         plot_counts(axes, _most([*map(str, items)]), [BLUE])
@@ -118,5 +119,10 @@ def _plot_values(axes: Axes, values: Sequence[Any], log: bool = False) -> None:
         axes.scatter(*np.transpose(values), s=10, c=BLUE, alpha=0.5, linewidths=0)
         axes.set_aspect("equal", adjustable="datalim")
     else:
-        axes.locator_params(axis="x", nbins=5)
-        axes.hist(items, int(np.clip(np.sqrt(len(items)), 8, 40)), color=BLUE, log=log)
+        _plot_numbers(axes, np.array(items))
+
+
+def _plot_numbers(axes: Axes, values: Array, log: bool = False) -> None:
+    """Plot a histogram of numbers (N,), perhaps with a logarithmic axis."""
+    axes.locator_params(axis="x", nbins=5)
+    axes.hist(values, int(np.clip(np.sqrt(len(values)), 8, 40)), color=BLUE, log=log)

@@ -8,8 +8,9 @@ from __future__ import annotations
 import json
 import logging
 import traceback
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -88,7 +89,7 @@ def _play_missing(
                     later.cancel()
                 break
             for result in results:
-                score.results[result.seed] = result
+                score.add(result)
                 if result.outcome != ERROR:
                     keep(result)
             progress.update(bar, completed=len(score.results), description=score.note())
@@ -109,6 +110,15 @@ class _Score:
     until: Callable[[Report], bool] | None
     turns: int
     counted: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self.outcomes.update(result.outcome for result in self.results.values())
+
+    def add(self, result: Result) -> None:
+        """Add a result."""
+        self.results[result.seed] = result
+        self.outcomes[result.outcome] += 1
 
     def report(self) -> Report:
         """Report the results that count."""
@@ -124,9 +134,10 @@ class _Score:
 
     def note(self) -> str:
         """Format the success so far."""
-        so_far = Report(tuple(self.results.values()))
-        errors = f", {len(so_far.errors)} errors" if so_far.errors else ""
-        return f"success {100 * so_far.success:.0f} %{errors}"
+        errors = self.outcomes[ERROR]
+        completed = self.outcomes.total() - errors
+        share = self.outcomes["success"] / completed if completed else 0.0
+        return f"success {100 * share:.0f} %" + (f", {errors} errors" if errors else "")
 
 
 def _results(future: Future, seeds: Sequence[int]) -> list[Result]:

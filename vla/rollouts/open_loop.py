@@ -64,7 +64,8 @@ def open_loop(agent: Agent, spec: Spec, episodes: Iterable[Episode], constant: A
 
     def by_recording(errors: Array) -> Array:
         """Return the (R, D) means of (E, D) errors over the episodes of every recording."""
-        return np.array([errors[np.array(recordings) == each].mean(0) for each in dict.fromkeys(recordings)])
+        numbers = np.array(recordings)
+        return np.array([errors[numbers == each].mean(0) for each in dict.fromkeys(recordings)])
 
     errors = np.array([np.abs(acts - seen).mean(0) for acts, seen in zip(predicted, recorded, strict=True)])
     means, constants = by_recording(errors), np.array([np.abs(actions - constant).mean(0) for actions in recorded])

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+import rerun_bindings
 import rerun_cli
 
 from vla.data.image_codec import encode
@@ -69,7 +70,7 @@ class RerunRecorder:
         content = rr.binary_stream(stream)  # Rerun's own file sink can block for ever on a full disk
         viewpoint = self._world.viewpoint if self._world else None
         events = getattr(self._environment, "events", ())
-        stream.send_blueprint(_blueprint(spec, bool(self._probabilities), bool(events), viewpoint), make_active=False)
+        _send_blueprint(stream, _blueprint(spec, bool(self._probabilities), bool(events), viewpoint))
         writer = _Writer(stream, spec)
         writer.facts(episode)
         writer.events(events)
@@ -80,9 +81,12 @@ class RerunRecorder:
         writer.curves(episode)
         if self._probabilities:
             writer.tokens(np.array([*self._probabilities]), np.stack([*self._probabilities.values()]))
-        with atomic_path(self._folder / f"{name}.rrd") as draft:
-            draft.write_bytes(content.read() or b"")
+        recording = content.read() or b""
         stream.disconnect()
+        del writer, stream
+        rerun_bindings.flush_and_cleanup_orphaned_recordings()  # else its threads and its memory stay
+        with atomic_path(self._folder / f"{name}.rrd") as draft:
+            draft.write_bytes(recording)
         self._pictured[episode.outcome] += 1
         if self._pictured[episode.outcome] <= self._pictures:
             save_moving_picture(episode, self._folder / f"{name}.webp")
@@ -273,6 +277,16 @@ def _blueprint(spec: Spec, tokens: bool, events: bool, viewpoint: tuple[Point, P
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
+
+
+def _send_blueprint(stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
+    """Do as `stream.send_blueprint(blueprint, make_active=False)`, which never frees the stream of the blueprint."""
+    native = rerun_bindings.new_blueprint("vla", make_default=False, make_thread_default=False)
+    own = rr.RecordingStream._from_native(native)
+    own.set_time("blueprint", sequence=0)
+    blueprint._log_to_stream(own)
+    rerun_bindings.send_blueprint(own.memory_recording().storage, False, True, recording=stream.to_native())
+    own.disconnect()
 
 
 def _curves(what: str, units: Sequence[str]) -> list[rrb.TimeSeriesView]:

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import logging
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Container, Iterable
 from contextlib import suppress
+from itertools import accumulate
 from pathlib import Path
 from typing import Literal
 
 from vla.rollouts.results import ERROR, Report, Result, recording_name
+
+log = logging.getLogger(__name__)
 
 # "all" episodes, the "failures" and a few successes, or so many episodes, failures first.
 Recordings = Literal["all", "failures"] | int
 
 SUCCESSES = 10  # successes beside the failures
 FAILURES_SHOWN, SUCCESSES_SHOWN = 6, 3  # moving pictures
+LARGEST, MOST = 1 << 29, 2000  # [bytes] and recordings in one file: to merge takes seven times as much memory
 SUFFIXES = (".rrd", ".webp")  # of a recording and of a moving picture
 
 
@@ -52,21 +58,31 @@ def clear(folder: Path, kept: Container[Path] = ()) -> None:
 
 
 def merge_recordings(report: Report, folder: Path, target: Path, wanted: Recordings) -> list[int]:
-    """Merge the `wanted` recordings of an evaluation into one file, failures first; return their seeds."""
+    """Merge the `wanted` recordings of an evaluation into one file, failures first; return their seeds.
+
+    Those beyond `LARGEST` or `MOST` stay single files, which is logged.
+    """
     from vla.rollouts.recorder import merge  # imports the viewer's library
 
     names = {each.seed: recording_name(each.seed, each.outcome) for each in chosen(report, wanted)}
     files = {seed: folder / f"{name}.rrd" for seed, name in names.items()}
-    recorded = [seed for seed, file in files.items() if file.exists()]
+    there = [seed for seed, file in files.items() if file.exists()]
+    sizes = accumulate(files[seed].stat().st_size for seed in there)
+    recorded = there[: max(1, min(MOST, bisect_right([*sizes], LARGEST)))]
     if recorded:
         merge([files[seed] for seed in recorded], target)
+    if single := len(there) - len(recorded):
+        log.info("%s has %d recordings, the %d others stay in %s", target, len(recorded), single, folder)
     return recorded
 
 
-def keep_pictures(report: Report, folder: Path, wanted: Recordings) -> None:
-    """Remove what was merged but for the moving pictures of the episodes to be `shown`, and a folder without any."""
+def keep_pictures(report: Report, folder: Path, wanted: Recordings, merged: Container[int]) -> None:
+    """Remove the recordings of the seeds that were merged, all moving pictures but those of the episodes to be `shown`,
+    and a folder without anything."""
     wanted_ones = chosen(report, wanted)
     pictures = pictured(wanted_ones, folder)
-    clear(folder, [pictures[each.seed] for each in shown(each for each in wanted_ones if each.seed in pictures)])
+    kept = {pictures[each.seed] for each in shown(each for each in wanted_ones if each.seed in pictures)}
+    single = (each for each in wanted_ones if each.seed not in merged)
+    clear(folder, kept | {folder / f"{recording_name(each.seed, each.outcome)}.rrd" for each in single})
     with suppress(OSError):
         folder.rmdir()

@@ -65,14 +65,16 @@ def shared_policy(make_policy: Callable[[], _Planner]) -> Iterator[Callable[[Env
                     last.send(None)  # ends `_accept`, which would not notice that its socket is closed
 
 
-def _accept(listener: Listener, begin: Callable[[int, Connection, Spec], object]) -> None:
-    """Begin a talk with every worker that connects, each in a lane of its own."""
-    for lane in count():
+def _accept(listener: Listener, begin: Callable[[int, Connection, Spec], Future[None]]) -> None:
+    """Begin a talk with every worker that connects, each in a lane of its own, until it has left."""
+    lanes = set[int]()
+    while True:
         with suppress(AuthenticationError, EOFError, OSError):  # whoever else finds the socket
             connection = listener.accept()
             if (spec := connection.recv()) is None:
                 return
-            begin(lane, connection, spec)
+            lanes.add(lane := next(number for number in count() if number not in lanes))
+            begin(lane, connection, spec).add_done_callback(lambda _, lane=lane: lanes.remove(lane))
 
 
 def _serve(policy: _Planner, requests: queue.Queue[Request | None]) -> None:
