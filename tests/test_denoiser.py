@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
-from fake_batch import make_batch, make_denoising, with_text
+from fake_batch import as_policy, make_batch, make_denoising, with_text
+from observing import observations
 from torch import Tensor
 
+from vla.deploy.inference import Inference
 from vla.models.denoiser import Denoiser, DenoisingModel
 from vla.models.diffusion import LEVELS, Diffusion, alpha_bar
 from vla.models.flow import Flow
@@ -104,3 +107,21 @@ def test_what_is_done_follows_from_the_noise(kind: type[DenoisingModel]) -> None
     model.temperature = 0.0
     middle = model.predict({**batch, "noise": one}).actions
     assert torch.equal(middle, model.predict({**batch, "noise": other}).actions)
+
+
+def test_on_a_robot_the_noise_differs_between_episodes_and_repeats() -> None:
+    model, (seen, *_) = make_denoising(Flow, temperature=1.0).eval(), observations(1)
+    runs = []
+    for warm in (True, False):
+        inference, plans = Inference(as_policy(model)), []
+        if warm:
+            inference.warm_up()
+        for _ in range(2):
+            inference.start(seen, first=True)
+            while (taken := inference.take()) is None:
+                pass
+            plans.append(taken[0])
+        inference.close()
+        assert not np.array_equal(plans[0], plans[1])
+        runs.append(plans)
+    assert np.array_equal(runs[0], runs[1])

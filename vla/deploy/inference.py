@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import count
 
 import numpy as np
 
@@ -12,12 +13,16 @@ from vla.spec import Array, Observation
 
 
 class Inference:
-    """One inference at a time, always in the same thread: compiled programs are kept per thread."""
+    """One inference at a time, always in the same thread: compiled programs are kept per thread.
+
+    The noise of a model is seeded with the number of the episode, so that it differs between episodes and repeats.
+    """
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="policy")
         self._running: Future[tuple[Array, float]] | None = None
+        self._episodes = count()
 
     @property
     def busy(self) -> bool:
@@ -30,6 +35,7 @@ class Inference:
         for _ in range(3):
             self._pool.submit(self._plan, noise, True).result()
         self._policy.reset("", 0)
+        self._episodes = count()
 
     def start(self, observation: Observation, first: bool) -> None:
         """Start an inference; `first` begins an episode."""
@@ -53,7 +59,7 @@ class Inference:
     def _plan(self, observation: Observation, first: bool) -> tuple[Array, float]:
         began = time.monotonic()
         if first:
-            self._policy.reset(observation.instruction, 0)
+            self._policy.reset(observation.instruction, next(self._episodes))
         plan = self._policy.plan(observation)
         # What the next plan continues goes on until that is there.
         chosen = plan if getattr(self._policy, "chunking", None) else plan[: executed(self._policy)]
