@@ -53,6 +53,7 @@ BAD_INPUT = {
     "~job": "~job leaves no job: choose another one, job=OPTION",
     "experiment=[standard,few]": "experiment=[standard,few] names several: experiment takes one option",
     "=3": "=3 has no key: write KEY=3",
+    "job=inspect inspect.seed=0": "there is no inspect.seed: there are folder, stores, where",
     "--resolve": "--resolve goes with --cfg job",
     "task.goal=lift": "got 'lift': an option is chosen with a slash, task/goal=lift",
     "-m seed=range(0,0)": "the sweep has no cells: one of its ranges or choices is empty",

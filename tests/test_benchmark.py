@@ -11,7 +11,7 @@ from torch import Tensor
 
 from vla.config.experiment import Experiment
 from vla.io.errors import UserError
-from vla.jobs.benchmark import acting
+from vla.jobs.benchmark import acting, run
 from vla.jobs.benchmark.measure import machine, measure, other_load
 from vla.models.layers import Batch
 from vla.models.model import Model
@@ -41,6 +41,15 @@ def test_the_time_of_other_programs_is_told_from_ones_own(monkeypatch: pytest.Mo
         return other_load()[0]
 
     assert loaded(5.0, 9.0, 3.0) - loaded(0.0, 0.0, 0.0) == pytest.approx(5.0 - 3.0)
+
+
+def test_a_benchmark_says_where_its_figures_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(acting, "policy", lambda experiment: {"policy": measure(3.0, "ms", 5, 2.0)})
+    with caplog.at_level("INFO", "vla"):
+        run(Experiment.of(composed("job=benchmark", "benchmark.names=[policy]", f"output={tmp_path}")))
+    assert caplog.messages[-1] == f"wrote {tmp_path / 'benchmark.json'}" and (tmp_path / "benchmark.json").is_file()
 
 
 class Peer:

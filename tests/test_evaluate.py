@@ -253,7 +253,7 @@ def test_recordings_are_kept_in_one_file_failures_first(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_only_recordings_that_are_kept_are_made(tmp_path: Path) -> None:
+def test_only_recordings_that_are_kept_are_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     makers = toy.make_environment, toy.make_agent, toy.make_recorder(tmp_path)
     everything = evaluate(*makers, SEEDS[:5])
     assert len([*tmp_path.iterdir()]) == 5
@@ -261,7 +261,9 @@ def test_only_recordings_that_are_kept_are_made(tmp_path: Path) -> None:
         file.unlink()
     names = ["failure-01000003-timeout", *(f"success-{seed:08d}" for seed in (*SEEDS[:3], SEEDS[4]))]
     for wanted, made in ((2, names[:2]), ("failures", names), (0, [])):
+        capsys.readouterr()
         assert evaluate(*makers, SEEDS[:5], recordings=wanted) == everything
+        assert ("recording" in capsys.readouterr().out) == bool(made)  # episodes are played once more, which takes time
         assert sorted(file.stem for file in tmp_path.iterdir()) == made
         for file in tmp_path.iterdir():
             file.unlink()

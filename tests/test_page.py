@@ -196,8 +196,16 @@ def test_what_is_missing_is_left_out(tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text(CURVES)
     save_training(tmp_path, Training(1, 39, 3.0, "interrupted"))
     told = text(write_page(tmp_path))
+    assert "p Holm" not in told
     assert f"Training was interrupted after 39 steps; resume={tmp_path} continues it." in told
     assert "Rollouts" not in told
+
+
+def test_a_training_without_curves_has_its_demonstrations(tmp_path: Path) -> None:
+    save_config(tmp_path, {"collect": {"episodes": 7}}, [])
+    assert "demonstrations" not in text(write_page(tmp_path))  # an evaluation of a policy from elsewhere
+    save_training(tmp_path, Training(1, 20, 3.0, "done"))
+    assert "demonstrations 7" in text(write_page(tmp_path))
 
 
 def test_conditions_over_other_networks_are_not_compared(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,8 @@ def reported(folder: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("whole")
-    here(folder, *COMMAND, "output=run")
+    done = here(folder, *COMMAND, "output=run")
+    assert "as configured (1 of 2)" in done.stdout and "short (2 of 2)" in done.stdout
     assert not (folder / "run" / PLAYED).exists()
     return reported(folder / "run")
 
@@ -57,7 +59,7 @@ def test_a_report_without_room_costs_no_episode_and_no_recording(
     assert "report.json cannot be written (No space left on device): make room there" in failed.stderr
     assert f"/{EPISODES} (" in failed.stdout and not (tmp_path / "run/report.json").exists()
     done = here(tmp_path, *asked)
-    assert f"already played, {2 * EPISODES} in all" in done.stdout + done.stderr
+    assert f"episodes already played: {2 * EPISODES}, in" in done.stdout + done.stderr
     assert not (tmp_path / "run" / PLAYED).exists()
     assert len(reported(tmp_path / "run")["recorded"]) == EPISODES
 
@@ -84,8 +86,33 @@ def test_only_episodes_that_ended_in_an_error_are_played_again(tmp_path: Path, w
         failed = here(tmp_path, *COMMAND, "output=run", ok=False)
     assert "1 episodes ended in an error, see run/report.json" in failed.stderr
     done = here(tmp_path, *COMMAND, "output=run")
-    assert f"already played, {2 * EPISODES - 1} in all" in done.stdout + done.stderr
+    assert f"episodes already played: {2 * EPISODES - 1}, in" in done.stdout + done.stderr
     assert reported(tmp_path / "run") == whole
+
+
+def test_an_interrupted_evaluation_says_which_command_goes_on(tmp_path: Path, whole: dict[str, Any]) -> None:
+    def interrupted(*arguments: str) -> str:
+        """What it says after each episode that it adds."""
+        add = Played.add
+
+        def add_one(self: Played, condition: str, result: Result) -> None:
+            add(self, condition, result)
+            raise KeyboardInterrupt
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Played, "add", add_one)
+            done = here(tmp_path, *COMMAND, *arguments, ok=False)
+        assert done.returncode == 130 and not done.stderr
+        return done.stdout
+
+    first = interrupted()
+    assert "already" not in first
+    (folder,) = re.findall(r"^interrupted: the same command with (output=outputs/runs/.+) continues$", first, re.M)
+    second = interrupted(folder)
+    assert "episodes already played: 1, in" in second
+    assert second.endswith("\ninterrupted: the same command continues\n")
+    here(tmp_path, *COMMAND, folder)
+    assert reported(tmp_path / folder.removeprefix("output="))["per_episode"] == whole["per_episode"]
 
 
 def play(folder: Path, head: dict[str, str], *seeds: int) -> dict[int, Result]:

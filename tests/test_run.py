@@ -421,6 +421,7 @@ def test_training_that_is_interrupted_saves_and_goes_on(home: Path) -> None:
         assert done.returncode == 130, done.stdout + done.stderr
         said = re.search(r"interrupted after (\d+) steps", done.stdout + done.stderr)
         assert said and f"{run.relative_to(home)}/checkpoints/last.ckpt" in done.stdout + done.stderr
+        assert "interrupted: the same command continues" in done.stdout + done.stderr
         assert f"Training was interrupted after {said[1]} steps" in page.read_text()
         return int(said[1])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import shutil
@@ -33,11 +34,14 @@ from vla.io.errors import UserError, suggestion
 from vla.io.printable import printable
 from vla.parallel.processes import ease_garbage_collection, spin_briefly, without_triton
 
+log = logging.getLogger("vla.run")  # also where this module is the program
+
 SWEEP = "in the sweep "  # prefix of a note on a cell's error
 PICKLE = "--experimental-rerun"  # option of Hydra
 OPTIONS = (PICKLE, "--cfg", "--config-dir", "--config-name", "--config-path", "--info", "--package")  # with values
 # Errors of a command line, a file or a machine.
 MENDABLE = (UserError, OSError, HydraException, OmegaConfBaseException, YAMLError, RecursionError)
+CONTINUED = ("collect", "train", "evaluate", "improve")  # jobs that go on where an earlier one ended, in its folder
 RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")  # variables that Lightning reads on its import
 TRACEBACKS = "VLA_TRACEBACKS"  # environment variable that passes the user's HYDRA_FULL_ERROR to child processes
 
@@ -86,7 +90,7 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
     key = str(error.full_key)
     *path, name = str(error.key).replace("/", ".").split(".")
     parent = OmegaConf.select(error.parent_node, ".".join(path)) if path else error.parent_node
-    known = [str(key) for key in parent if key != "hydra"] if isinstance(parent, DictConfig) else []
+    known = [str(key) for key in parent if key not in ("hydra", "_target_")] if isinstance(parent, DictConfig) else []
     among = _among(name, known) if known else ""
     # The task of a checkpoint may have other keys than that of the command.
     return f"there is no {key}{among}" + (f"; +{key}=VALUE adds it" if among[:1] == ":" or key[:5] == "task." else "")
@@ -207,11 +211,27 @@ def _end(error: Exception) -> NoReturn:
     sys.exit(1)
 
 
+def _say_how_to_continue(cfg: DictConfig) -> None:
+    """Log which command goes on after an interruption; without `output=` or `resume=` every command has a new folder.
+
+    Cells of a sweep say nothing: they may be many, each in a process of its own.
+    """
+    if HydraConfig.get().mode == RunMode.RUN and cfg.job in CONTINUED:
+        overrides = HydraConfig.get().overrides
+        given = {override.partition("=")[0] for override in (*overrides.task, *overrides.hydra)}
+        has_folder = cfg.job == "collect" or given & {"output", "resume", "hydra.run.dir"}
+        added = "" if has_folder else f" with output={os.path.relpath(cfg.output)}"
+        log.info("interrupted: the same command%s continues", added)
+
+
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def _compose(cfg: DictConfig) -> float | None:
     try:
         with _without_empty_folders(cfg):
             return _do(cfg)
+    except KeyboardInterrupt:
+        _say_how_to_continue(cfg)
+        raise
     except Exception as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
             _fail(error)  # a sweeper may continue with the next job

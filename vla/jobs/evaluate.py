@@ -197,11 +197,12 @@ def _play(
     play = partial(evaluate, cluster=experiment.cluster(), turns=turns, lanes=lanes, recordings=wanted.recordings)
     conditions, reports, seeds = _conditions(experiment, make_agent), dict[str, Report](), list(wanted.seeds)
     until = (lambda report: all(each.is_decided(report) for each in statements)) if statements else None
-    for name, (make_environment, make_its_agent) in conditions.items():
+    for number, (name, (make_environment, make_its_agent)) in enumerate(conditions.items(), 1):
         first = name == IN_DISTRIBUTION
+        label = "as configured" if first else name
         reports[name] = play(
             *(make_environment, make_its_agent, make_recorder if first else None, seeds),
-            name="as configured" if first else name,
+            name=f"{label} ({number} of {len(conditions)})" if len(conditions) > 1 else label,
             until=until if wanted.until else None,
             known=played.results[name],
             keep=partial(played.add, name),

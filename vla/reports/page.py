@@ -15,15 +15,16 @@ from markupsafe import Markup
 from vla.io.documents import read_bounded
 from vla.io.errors import UserError
 from vla.io.files import write_text
-from vla.reports.tables import Table, in_words
+from vla.reports.tables import DIFFERENCE, Table, in_words
 from vla.rollouts.moving_picture import LARGEST
 from vla.rollouts.results import Result
 
 WILSON = "Wilson's; those of several trainings account for correlation within trainings and within scenes"
 EXACT = "of McNemar's exact test on episodes with the same seeds, and of Fisher's on others, with Newcombe's intervals"
 EARLY = "by betting, valid at any time, where playing stopped as soon as it was clear, and else"
-NOTES = (
-    "Rates have 95 % confidence intervals ({}). p is {}; p Holm is adjusted for all comparisons in the table, so that "
+RATES = "Rates have 95 % confidence intervals ({})."
+COMPARED = (
+    "p is {}; p Holm is adjusted for all comparisons in the table, so that "
     "at most 5 % of tables have a false difference. The verdict is a difference with p Holm of at most 0.05, not worse "
     "if the interval, which is not adjusted, excludes a loss of that many percentage points, and open otherwise."
 )
@@ -58,12 +59,15 @@ def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bo
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(embedded=_embedded, in_words=in_words)
+    parts = [part for part in parts if part.rows]
+    compares = any(isinstance(part, Table) and {*DIFFERENCE} <= {*part.heads} for part in parts)
+    notes = f"{RATES} {COMPARED}" if compares else RATES
     content = dict.fromkeys(("subtitle", "warning", "rate", "of"), "") | content
     text = environment.get_template("page.html").render(
         title=title,
-        parts=[part for part in parts if part.rows],
+        parts=parts,
         written=f"{datetime.now():%Y-%m-%d %H:%M}",
-        notes=NOTES.format(*(f"{EARLY} {each}" if anytime else each for each in (WILSON, EXACT))),
+        notes=notes.format(*(f"{EARLY} {each}" if anytime else each for each in (WILSON, EXACT))),
         **content,
     )
     write_text(path, text)

@@ -98,7 +98,7 @@ def _facts(run: Run) -> dict[str, str]:
         facts["time per action"] = f"{report.latency_ms:.1f} ms"
     if training:
         facts["training"] = f"{training.steps} steps in {duration(training.seconds)}"
-    if run.metrics and (demonstrations := at(run.config, "collect.episodes")) != ABSENT:
+    if training and (demonstrations := at(run.config, "collect.episodes")) != ABSENT:
         facts["demonstrations"] = str(demonstrations)
     if report and report.seeds:
         seeds = f"seeds {min(report.seeds)} to {max(report.seeds)}"

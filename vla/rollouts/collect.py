@@ -15,11 +15,10 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from vla.data.episodes import EpisodeStore
 from vla.data.index import DAMAGED, NOT_NEEDED
 from vla.io.errors import UserError
+from vla.io.progress import Bar
 from vla.parallel.pool import Cluster, Future, Pool, WorkersLost
 from vla.parallel.processes import WorkerFactory
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, close_agent, replay, rollout
@@ -159,9 +158,7 @@ def _fill(
     before, attempts, started = len(store.episodes), _Attempts(pool, multitask, store, seed), time.monotonic()
     outcomes = Counter(entry.success for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED))
     in_a_row = defaultdict[str, list[str]](list)  # task → outcomes of the failures since its last success
-    columns = (TextColumn("collecting"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, TimeRemainingColumn()) as progress:
-        bar = progress.add_task("", total=episodes, completed=before)
+    with Bar("collecting", episodes, before) as bar:
         while (stored := len(store.episodes)) < episodes:
             # No more pending than missing: without failures no episode is wasted.
             episode = attempts.next(min(LOOK_AHEAD * pool.size, episodes - stored))
@@ -178,8 +175,7 @@ def _fill(
                 _give_up_after(episode.task, in_a_row[episode.task])
             speed = (len(store.episodes) - before) / (time.monotonic() - started)
             rate = outcomes[True] / outcomes.total()
-            description = f"{speed:.1f} episodes/s, success {rate:.0%}"
-            progress.update(bar, completed=len(store.episodes), description=description)
+            bar.show(len(store.episodes), f"{speed:.1f} episodes/s, success {rate:.0%}")
 
 
 def _give_up_after(task: str, failures: Sequence[str]) -> None:

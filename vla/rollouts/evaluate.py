@@ -14,9 +14,8 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from vla.io.errors import UserError
+from vla.io.progress import Bar
 from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed, Future, Pool
 from vla.rollouts.motion import motion_of
 from vla.rollouts.recordings import Recordings, chosen
@@ -66,8 +65,8 @@ def evaluate(
     with cluster.pool(make) as pool:
         _play_missing(pool, score, at_once, 1 if lanes == 1 else ROUNDS * lanes, name, keep or (lambda result: None))
         report = score.report()
-        if make_recorder is not None and not at_once:
-            _record(pool, chosen(report, recordings))
+        if make_recorder is not None and not at_once and (again := chosen(report, recordings)):
+            _record(pool, again)
     return report
 
 
@@ -75,9 +74,7 @@ def _play_missing(
     pool: Pool, score: _Score, recorded: bool, size: int, name: str, keep: Callable[[Result], None]
 ) -> None:
     """Play the missing episodes in groups of `size`, until `score.until` is true of the results that count."""
-    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, TimeRemainingColumn()) as progress:
-        bar = progress.add_task("", total=len(score.seeds), completed=len(score.results))
+    with Bar(name, len(score.seeds), len(score.results), score.note() if score.results else "") as bar:
         missing = [] if score.advance() else [seed for seed in score.seeds if seed not in score.results]
         groups = [missing[first : first + size] for first in range(0, len(missing), size)]
         group_of, crashed = {pool.submit((group, recorded)): group for group in groups}, False
@@ -92,7 +89,7 @@ def _play_missing(
                 score.add(result)
                 if result.outcome != ERROR:
                     keep(result)
-            progress.update(bar, completed=len(score.results), description=score.note())
+            bar.show(len(score.results), score.note())
             if score.advance():
                 for later in group_of:
                     later.cancel()
@@ -151,15 +148,17 @@ def _results(future: Future, seeds: Sequence[int]) -> list[Result]:
 def _record(pool: Pool, results: Sequence[Result]) -> None:
     """Play episodes once more and record them; log a warning for those that are played differently."""
     expected = {pool.submit(([result.seed], True)): result for result in results}
-    for future in pool.as_completed(expected):
-        result = expected[future]
-        (again,) = _results(future, [result.seed])
-        if again.outcome != result.outcome:
-            ended = again.error or again.outcome
-            log.warning("seed %d has no recording: when played again it ended with %s", result.seed, ended)
-        elif again.steps != result.steps:
-            took = "seed %d is recorded as played again: in %d steps, where it had taken %d"
-            log.warning(took, result.seed, again.steps, result.steps)
+    with Bar("recording", len(expected)) as bar:
+        for done, future in enumerate(pool.as_completed(expected), 1):
+            result = expected[future]
+            (again,) = _results(future, [result.seed])
+            bar.show(done)
+            if again.outcome != result.outcome:
+                ended = again.error or again.outcome
+                log.warning("seed %d has no recording: when played again it ended with %s", result.seed, ended)
+            elif again.steps != result.steps:
+                took = "seed %d is recorded as played again: in %d steps, where it had taken %d"
+                log.warning(took, result.seed, again.steps, result.steps)
 
 
 def play_episode(environment: Environment, agent: Agent, seed: int) -> Result:

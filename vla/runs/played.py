@@ -45,7 +45,8 @@ class Played:
                     break
                 self.results[condition][result.seed] = result
                 lines.append(f"{line}\n")
-            log.info("%s: already played, %d in all", self._path, len(lines) - 1)
+            if played := len(lines) - 1:
+                log.info("episodes already played: %d, in %s", played, self._path)
         write_text(self._path, "".join(lines))
 
     def __enter__(self) -> Played:

@@ -97,7 +97,7 @@ class GracefulStop(Checkpoint):
             trainer.save_checkpoint(self._path, weights_only=False)
             trainer.should_stop = True
             trainer.limit_val_batches = 0  # else Lightning validates again before it stops
-            log.info("interrupted after %d steps, see %s; resume=last continues", trainer.global_step, self._path)
+            log.info("interrupted after %d steps, see %s", trainer.global_step, self._path)
         elif trainer.global_step % SAVE_EVERY == 0:
             trainer.save_checkpoint(self._path, weights_only=False)
 

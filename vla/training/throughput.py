@@ -8,6 +8,12 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar
+from rich.progress import TimeRemainingColumn
+from rich.table import Column
+
+from vla.io.progress import Lines
+
+MUCH = 0.05  # share of the time that waits for data, above which the bar shows it
 
 
 class Throughput(Callback):
@@ -70,6 +76,7 @@ class TrainingProgressBar(RichProgressBar):
     def __init__(self) -> None:
         super().__init__(refresh_rate=4)  # a second: painting takes milliseconds, in a thread that the model waits for
         self._loss: float | None = None  # unknown before the first step, also after resuming
+        self._lines = Lines()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -78,6 +85,19 @@ class TrainingProgressBar(RichProgressBar):
         if self._loss is None or batch_idx % self.READ_EVERY == 0:
             self._loss = outputs["loss"].item() * trainer.accumulate_grad_batches  # Lightning divides it by these
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        if self.is_enabled and self._lines.are_due():
+            note = ", ".join(f"{name} {value}" for name, value in self.get_metrics(trainer, pl_module).items())
+            self._lines.say("training", batch_idx + 1, self.total_train_batches, note, self._time_left())
+
+    def _time_left(self) -> float | None:
+        tasks = {task.id: task for task in self.progress.tasks} if self.progress else {}
+        return tasks[self.train_progress_bar_id].time_remaining if self.train_progress_bar_id in tasks else None
+
+    def configure_columns(self, trainer: Trainer) -> list[Any]:
+        """Return what fits in a line of 80 columns beside the metrics, which would else take several lines."""
+        description, bar, batches, _, speed = super().configure_columns(trainer)
+        self._metric_component._table_column = Column(no_wrap=True)  # type: ignore[union-attr]
+        return [description, bar, batches, TimeRemainingColumn(), speed]
 
     @property
     def total_train_batches(self) -> int | float:
@@ -88,13 +108,12 @@ class TrainingProgressBar(RichProgressBar):
     def get_metrics(
         self, trainer: Trainer, pl_module: LightningModule
     ) -> dict[str, int | str | float | dict[str, float]]:
-        """Return the columns beside the bar: loss, samples per second, share of waiting for data, success."""
+        """Return the columns beside the bar: loss, share of waiting for data if it is much, success."""
         logged = trainer.callback_metrics
         shown: dict[str, int | str | float | dict[str, float]] = {}
         if self._loss is not None:
             shown["loss"] = f"{self._loss:.3f}"
-        if "pace/samples_per_s" in logged:
-            shown["samples/s"] = f"{logged['pace/samples_per_s']:.0f}"
+        if logged.get("pace/waiting", 0) > MUCH:
             shown["waiting"] = f"{logged['pace/waiting']:.0%}"
         if "val/success" in logged:
             shown["success"] = f"{logged['val/success']:.0%}"

@@ -38,8 +38,10 @@ def run(experiment: Experiment) -> dict[str, Measure]:
         if used > BUSY * cores():
             slower = "is slower here than on an idle machine, and its ratios are less exact"
             log.warning("%s %s: other programs used %.1f cores meanwhile", name, slower, used)
-    write_json(experiment.output / "benchmark.json", {"machine": here, "measures": found})
+    file = experiment.output / "benchmark.json"
+    write_json(file, {"machine": here, "measures": found})
     heads = ("stage", "value", "unit", "n", "floor", "ratio", "others [cores]")
     rows = [[name, *map(str, each.values())] for name, each in found.items()]
     show(Table(heads, rows, ", ".join(map(str, here.values()))))
+    log.info("wrote %s", file)
     return found
