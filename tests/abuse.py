@@ -26,89 +26,32 @@ from hostile import hiding, hostile, listener, put, save
 from saved_policies import save_run
 from trials import CHECKPOINT, EVALUATE, TRAIN, Trials, last, run
 
-WRONG = (
-    *(
-        "job=colect",
-        "model=rt2",
-        "model.widht=3",
-        "trainer.max_steps=many",
-        "checkpoint=nowhere.ckpt",
-        "task/goal=lfit",
-    ),
-    *(
-        "checkpoint=last",
-        "job=report",
-        "job=deploy deploy=ros2",
-        "job=inspect inspect.folder=nowhere",
-        "seed=",
-        "=",
-        "a=b",
-    ),
-    *("job=collect task.time_limit=nan", "job=collect task.time_limit=inf", "job=collect task.goal.radius=nan"),
-    *("job=collect expert.perturb.rate=nan", "job=collect task.randomize.mass.factor=[nan,nan]"),
-    *("job=collect task.randomize.mass.factor=[0,0]", "job=collect task.randomize.mass.factor=[-1,-1]"),
-    *("job=collect task.randomize.size.half_size=[0,0]", "job=collect task.goal.language.phrasings=[]"),
-    *("job=collect task.goal.language.phrasings=['{nope}']", "job=collect task.goal.language.phrasings=['{']"),
-    *("job=collect task.goal.language.phrasings=['{0.__class__}']", "job=collect expert.perturb.steps=[5,2]"),
-    *("seed=99999999999999999999", "data.seed=-1", "model.chunk=0", "model.chunk=-1", "model.width=-1"),
-    *("model.image.strides=[0,1,1]", "model.image.kernels=[0,0,0]", "model.image.kernels=[3]"),
-    *("trainer.val_check_interval=0", "trainer.accumulate_grad_batches=0", "trainer.devices=-7", "trainer.devices=99"),
-    *("job=collect task.image_size=[1,1]", "job=collect task.cameras=[front,front]", "job=collect task.cameras=[top]"),
-    *("job=collect task.randomize.mass.factor=[2,1]", "job=collect task.randomize.camera.fovy=500"),
-    *("job=collect task.randomize.arm.x=[5,5]", "job=collect expert.perturb.rate=-1", "job=collect collect.folder="),
-    *("job=collect expert.perturb.noise=1e9", "model.width=0", "model.keypoints=0", "model.text_width=0"),
-    *("model.shift=[-1,-1]", "model.auxiliary=nan", "model.auxiliary=-1", "model.image.kernels=[99,99,99]"),
-    *("tokenizer.smoothing=-1", "tokenizer.margin=-5", "learner.warmup_steps=-1", "trainer.gradient_clip_val=-1"),
-    *(
-        "trainer.max_steps=0",
-        "job=deploy deploy=loop deploy.episodes=0 checkpoint=CKPT",
-        "job=benchmark benchmark.names=[]",
-    ),
-    *("job=inspect inspect.stores=[] inspect.into=x", "data.batch_size=10000000", "tokenizer.bins=1000000"),
-    *("job=collect task.image_size=[4096,4096]", "job=collect task.randomize.size.half_size=[10,10]"),
-    *("checkpoint=CKPT resume=true", "checkpoint=CKPT job=train", "checkpoint=CKPT model.width=3", "checkpoint=STORE"),
-    *(
-        "checkpoint=CKPT policy.device=cuda",
-        "checkpoint=CKPT task.control_hz=3",
-        "evaluate.seed=0",
-        "validate.episodes=1 validate.seed=1000000",
-    ),
-    *(
-        "job=deploy deploy=ros2 checkpoint=CKPT --ros-args --nonsense",
-        "job=export export.folder=",
-        "pretrained=nowhere.ckpt",
-    ),
-    *(
-        "job=deploy deploy=ros2 checkpoint=CKPT deploy.topics.commands=bad!topic",
-        "job=export export=program",
-    ),
-    *(
-        "job=deploy deploy=ros2 checkpoint=CKPT deploy.network.domain=9999",
-        "expert=lerobot",
-        "expert=lerobot expert.folder=.",
-    ),
-    *(
-        "job=report report.runs=[DAMAGED/list]",
-        "job=report report.runs=[DAMAGED/config]",
-        "job=report report.runs=[DAMAGED/training]",
-    ),
-    *(
-        "job=report report.runs=[DAMAGED/metrics]",
-        "job=report report.runs=[DAMAGED/loop]",
-        "job=report report.runs=[DAMAGED/empty]",
-    ),
-    *(
-        "job=report report.runs=[DAMAGED/bomb]",
-        "logger=wandb",
-        "logger=mlflow",
-        "tokenizer=fast",
-    ),
-    *(
-        "trainer.accelerator=gpu",
-        "trainer=fsdp",
-        "trainer.precision=8",
-    ),
-)
+# Command lines beside those of `test_bad_input`: what is common to some → what each of them ends with.
+WRONG = {
+    "": """
+        job=colect model.widht=3 task/goal=lfit checkpoint=last seed= = a=b model.image.kernels=[3] trainer.devices=99
+        data.batch_size=10000000 checkpoint=STORE evaluate.seed=0 pretrained=nowhere.ckpt expert=lerobot logger=wandb
+        logger=mlflow tokenizer=fast trainer.accelerator=gpu trainer=fsdp trainer.precision=8
+    """,
+    "job=collect": """
+        task.randomize.mass.factor=[-1,-1] task.goal.language.phrasings=['{nope}'] task.goal.language.phrasings=['{']
+        task.goal.language.phrasings=['{0.__class__}'] task.cameras=[top]
+    """,
+    "job=report": """
+        report.runs=[DAMAGED/list] report.runs=[DAMAGED/config] report.runs=[DAMAGED/training]
+        report.runs=[DAMAGED/metrics] report.runs=[DAMAGED/loop] report.runs=[DAMAGED/empty] report.runs=[DAMAGED/bomb]
+    """,
+    "checkpoint=CKPT": "resume=true job=train model.width=3 policy.device=cuda task.control_hz=3",
+    "job=deploy": "deploy=ros2",
+    "job=deploy deploy=ros2 checkpoint=CKPT": "deploy.topics.commands=bad!topic deploy.network.domain=9999",
+    "job=deploy deploy=ros2 checkpoint=CKPT --ros-args": "--nonsense",
+    "job=deploy deploy=loop checkpoint=CKPT": "deploy.episodes=0",
+    "job=inspect": "inspect.folder=nowhere",
+    "job=inspect inspect.stores=[]": "inspect.into=x",
+    "job=export": "export=program",
+    "expert=lerobot": "expert.folder=.",
+    "validate.episodes=1": "validate.seed=1000000",
+}
 # `store.json` and lines of an index that no collection writes: where, and what stands there.
 HEADERS: tuple[tuple[str, Any], ...] = (
     *((f"spec.{name}", 5) for name in ("cameras", "action", "state", "state_units", "units", "low", "image_size")),
@@ -140,15 +83,14 @@ def prepared(root: Path) -> None:
 def commands(root: Path) -> Trials:
     """Command lines that ask for what cannot be: each ends in one sentence."""
     stands = {"CKPT": CHECKPOINT, "STORE": "store/store.json", "DAMAGED": "damaged"}
-    for wrong in WRONG:
-        line = wrong
+    for line in (f"{common} {end}".strip() for common, ends in WRONG.items() for end in ends.split()):
+        arguments = line
         for name, path in stands.items():
-            line = line.replace(name, path)
+            arguments = arguments.replace(name, path)
         groups = () if "job=" in line or "checkpoint=" in line else (*TRAIN, "collect.folder=store")
-        how, printed = run(
-            root, *groups, *line.split(" "), *(["output=wrong"] if "checkpoint=last" not in line else [])
-        )
-        yield wrong, how == "sentence", f"{how}: {last(printed)}"
+        output = () if "checkpoint=last" in line else ("output=wrong",)
+        how, printed = run(root, *groups, *arguments.split(), *output)
+        yield line, how == "sentence", f"{how}: {last(printed)}"
 
 
 def headers(root: Path) -> Trials:
@@ -198,15 +140,10 @@ def disks(root: Path) -> Trials:
     """Every job where no file may grow beyond 20 kB, which is what a full disk looks like."""
     for line in (
         *("job=preview preview.episodes=1", "job=collect collect.episodes=12"),
-        *(
-            "job=export export=lerobot export.folder=full",
-            "checkpoint=CKPT policy=onnx policy.folder=full evaluate.episodes=1 cluster.workers=1",
-        ),
-        *(
-            "job=collect collect.episodes=12 collect.images=jpeg",
-            "job=inspect inspect.into=full inspect.stores=[store]",
-        ),
-        *("job=train trainer.max_steps=4", "checkpoint=CKPT evaluate.episodes=1 cluster.workers=1"),
+        *("job=export export=lerobot export.folder=full", "job=inspect inspect.into=full inspect.stores=[store]"),
+        *("job=collect collect.episodes=12 collect.images=jpeg", "job=train trainer.max_steps=4"),
+        "checkpoint=CKPT evaluate.episodes=1 cluster.workers=1",
+        "checkpoint=CKPT policy=onnx policy.folder=full evaluate.episodes=1 cluster.workers=1",
     ):
         arguments = line.replace("CKPT", CHECKPOINT).split(" ")
         small = () if "checkpoint" in line or "preview" in line or "inspect" in line else (*TRAIN[:-1],)

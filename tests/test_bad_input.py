@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from command_line import SMALL, here
+from command_line import SMALL, here, vla
 from composing import check, composed
 
 from vla.config.build import build
@@ -138,17 +135,12 @@ def test_an_experiment_may_have_options_of_another_job() -> None:
     check(composed("experiment=few_improved", "job=collect"))
 
 
-def test_without_gl_the_error_says_what_to_install(tmp_path: Path) -> None:
-    environment = {**os.environ, "MUJOCO_GL": "egl", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nowhere.json"}
+def test_without_gl_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json")
     for name in (WORKING_BACKEND, "DISPLAY"):
-        environment.pop(name, None)
-    done = subprocess.run(
-        [sys.executable, "-m", "vla.run", "job=preview", "preview.episodes=1"],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
+        monkeypatch.delenv(name, raising=False)
+    done = vla(tmp_path, "job=preview", "preview.episodes=1", ok=False)
     assert done.returncode == 1 and "libegl1" in done.stderr and "Traceback" not in done.stderr
 
 

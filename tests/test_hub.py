@@ -14,42 +14,34 @@ from huggingface_hub import constants
 from vla.io.errors import UserError
 from vla.models.hub import fetch
 
-FILES = {"config.json": b"{}", "model.safetensors": b"weights", "pytorch_model.bin": b"pickle"}
+FILES = {"config.json": "{}", "model.safetensors": "weights", "pytorch_model.bin": "pickle"}
 COMMIT = "0" * 40
-MODEL = {
-    "/api/models/somebody/model/revision/main": {"id": "somebody/model", "sha": COMMIT, "siblings": []},
-    f"/api/models/somebody/model/tree/{COMMIT}": [
-        {"type": "file", "path": name, "size": len(content), "oid": name} for name, content in FILES.items()
-    ],
+ENTRIES = [{"type": "file", "path": name, "size": len(content), "oid": name} for name, content in FILES.items()]
+ANSWERS = {  # of as much of the hub as a download needs, with one model, `somebody/model`
+    "/api/models/somebody/model/revision/main": json.dumps({"id": "somebody/model", "sha": COMMIT, "siblings": []}),
+    f"/api/models/somebody/model/tree/{COMMIT}": json.dumps(ENTRIES),
+    **{f"/somebody/model/resolve/{COMMIT}/{name}": content for name, content in FILES.items()},
 }
 
 
 class Hub(BaseHTTPRequestHandler):
-    """As much of the hub as a download needs, with one model, `somebody/model`."""
+    """Answers, and remembers the names of files that are downloaded."""
 
     downloads: list[str]
 
-    def do_HEAD(self) -> None:
-        self.answer()
-
     def do_GET(self) -> None:
-        body = self.answer()
-        if "/resolve/" in self.path:
-            self.downloads.append(self.path.rpartition("/")[2])
-        self.wfile.write(body)
-
-    def answer(self) -> bytes:
-        """Send the headers; the body that belongs to them."""
         path = self.path.partition("?")[0]
-        name = path.rpartition("/")[2]
-        known = path in MODEL or path == f"/somebody/model/resolve/{COMMIT}/{name}"
-        body = json.dumps(MODEL[path]).encode() if path in MODEL else FILES.get(name, b"")
+        body, name = ANSWERS.get(path, "").encode(), path.rpartition("/")[2]
         headers = {"ETag": f'"{name}"', "X-Repo-Commit": COMMIT, "Content-Length": str(len(body))}
-        self.send_response(200 if known else 404)
-        for key, value in (headers if known else {"X-Error-Code": "RepoNotFound"}).items():
+        self.send_response(200 if body else 404)
+        for key, value in (headers if body else {"X-Error-Code": "RepoNotFound"}).items():
             self.send_header(key, value)
         self.end_headers()
-        return body if known else b""
+        if self.command == "GET":
+            self.wfile.write(body)
+            self.downloads += [name] if "/resolve/" in path else []
+
+    do_HEAD = do_GET
 
     def log_message(self, format: str, *arguments: object) -> None:
         """Nothing."""

@@ -12,6 +12,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+import warm
 from command_line import SMALL
 
 ROOT = Path(__file__).parents[1]
@@ -161,7 +162,8 @@ check(Experiment.of(adopt(compose(*robot), robot)), find("deploy"))
 sys.argv[1:] += ["output=further", "collect.episodes=13"]
 main()
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=home, capture_output=True, text=True, timeout=120)
+    (home / "no_simulator.py").write_text(code)
+    done = warm.run(home, program="no_simulator")
     assert (home / "without/checkpoints/last.ckpt").is_file(), done.stderr
     assert "Tabletop, which cannot be imported" in done.stderr and "Traceback" not in done.stderr
     assert done.stderr.count("error:") == 1 and not (home / "further/checkpoints/last.ckpt").exists()
@@ -178,12 +180,21 @@ def test_only_worlds_of_mujoco_choose_its_backend_and_before_they_import_it() ->
     assert worlds <= choosing and all(within(module, ("vla.tasks",)) for module in choosing)
 
 
-@pytest.mark.parametrize("option", [["--help"], ["--cfg", "job"], ["--cfg", "job", "--resolve"]])
-def test_questions_are_answered_without_heavy_imports(option: list[str]) -> None:
-    command = [sys.executable, "-X", "importtime", "-m", "vla.run", *option]
+MENU = (
+    "task/goal: chain, lift, mixed, pick_place, pick_place_or_stay, pick_place_two, ",
+    "  evaluate    The default: collect, train and report a success rate",
+)
+
+
+@pytest.mark.parametrize(
+    ("question", "words"),
+    [("--help", MENU), ("--cfg job --resolve", ("chosen:\n  experiment: null\n  model: bc\n",))],
+)
+def test_questions_are_answered_without_heavy_imports(question: str, words: tuple[str, ...]) -> None:
+    command = [sys.executable, "-X", "importtime", "-m", "vla.run", *question.split()]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr[-500:]
-    assert "evaluate" in done.stdout
+    assert all(each in done.stdout for each in words), done.stdout
     imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "vla.config.check" in imported
     assert imported.isdisjoint(HEAVY)

@@ -74,7 +74,7 @@ def test_a_policy_is_evaluated_recorded_and_reported(folder: Path, tmp_path: Pat
     assert (tmp_path / "sweep.html").is_file()
 
 
-@pytest.mark.parametrize("model", ["act", "diffusion", "flow"])
+@pytest.mark.parametrize("model", ["act", "flow"])
 def test_models_of_actions_that_are_no_tokens_are_trained_and_act(model: str, folder: Path) -> None:
     few = ("collect.episodes=30", "data.batch_size=4", "data.validation_fraction=0")
     policy = policy_of(folder, overrides=(f"model={model}", "model.width=32", *few))

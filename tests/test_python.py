@@ -12,7 +12,6 @@ from documented import ROOT
 
 from vla.api import load_environment, load_policy
 from vla.config import packages
-from vla.data.episodes import EpisodeStore
 from vla.envs.gym import GymEnvironment
 from vla.policy import Policy
 from vla.spec import Observation
@@ -66,9 +65,3 @@ def test_trust_is_an_argument_of_packages(home: Path, monkeypatch: pytest.Monkey
             load(home / CHECKPOINT, trust="documented")
     load_policy(home / CHECKPOINT, trust=["documented"])  # without a distribution, as a module of one's own
     assert os.environ[packages.TRUSTED] == ""
-
-
-def test_a_store_is_arrays(folder: Path) -> None:
-    store = EpisodeStore(folder)
-    rows = store.read(store.episodes[-1])
-    np.testing.assert_array_equal(rows["action"], store.rows("action")[store.episodes[-1].span])

@@ -220,14 +220,6 @@ def test_a_row_that_stopped_when_it_was_clear_has_its_anytime_valid_interval(tmp
     assert "by betting, valid at any time, where playing stopped" in (tmp_path / "sweep.html").read_text()
 
 
-def test_rows_of_other_worlds_are_not_compared(tmp_path: Path) -> None:
-    for number, level in enumerate(("default", "wide")):
-        config, drawn = {"task": {"randomize": level}}, {"light": number}
-        cell(tmp_path, number, [f"task/randomize={level}"], 5, config=config, draws=lambda n, drawn=drawn: drawn)
-    assert not compare_rows(tabulate(tmp_path))
-    assert "Differences in success" not in (tmp_path / "sweep.html").read_text()
-
-
 def test_over_the_number_of_demonstrations_success_is_a_curve_under_each_condition(
     tmp_path: Path, figures: list[Figure]
 ) -> None:

@@ -8,12 +8,20 @@ import shlex
 import shutil
 from pathlib import Path
 
-from command_line import SMALL, vla
+import warm
+from command_line import SMALL
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/tutorial.md").read_text(encoding="utf-8")
 FILES = re.findall(r"^```(?:python|yaml)\n# (\S+)\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-COMMANDS = re.findall(r"^python -m vla\.run (.*)$", PAGE, re.MULTILINE)
+LOOK, *COMMANDS = re.findall(r"^python -m vla\.run (.*)$", PAGE, re.MULTILINE)
+FOLLOW = """
+import json, sys
+from vla.run import main
+for command in json.loads(sys.argv[1]):
+    sys.argv[1:] = command
+    main()
+"""
 
 
 def small(command: str) -> list[str]:
@@ -30,9 +38,12 @@ def test_the_tutorial_ends_with_a_policy_for_its_own_goal(tmp_path: Path) -> Non
     for name, text in FILES:
         assert not (tmp_path / name).exists()
         (tmp_path / name).write_text(text, encoding="utf-8")
-    assert len(FILES) == 2 and len(COMMANDS) == 4
-    for command in COMMANDS:
-        vla(tmp_path, *shlex.split(command), *small(command))
+    assert len(FILES) == 2 and len(COMMANDS) == 3
+    assert LOOK == "job=preview output=outputs/look"  # without these files: see test_run
+    (tmp_path / "follow.py").write_text(FOLLOW)
+    commands = json.dumps([[*shlex.split(command), *small(command)] for command in COMMANDS])
+    done = warm.run(tmp_path, commands, program="follow")
+    assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((tmp_path / "outputs/runs/left_of/report.json").read_text(encoding="utf-8"))
     assert report["config"]["task"]["goal"]["_target_"].endswith(".LeftOf")
     assert {result["task"] for result in report["per_episode"]} == {"left_of"}

@@ -10,6 +10,7 @@ import atexit
 import gc
 import json
 import os
+import pickle
 import runpy
 import shutil
 import signal
@@ -18,7 +19,7 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from copy import copy, deepcopy
+from copy import copy
 from pathlib import Path
 from select import select
 from socket import AF_UNIX, create_server, socket
@@ -170,8 +171,8 @@ def compose_faster() -> None:
     """Leave out what takes Hydra and OmegaConf more than half of their time and changes nothing.
 
     OmegaConf reads files without libyaml, and tells every node its parent after each merge, whether it has one already
-    or not. Hydra makes a config of all choices for every file, in case its defaults refer to one, and reads all files
-    again for every composition.
+    or not. Hydra makes a config of all choices for every file, in case its defaults refer to one, and for every
+    composition reads all files again and copies all that knows where they are.
     """
     import yaml
     from hydra._internal import defaults_list
@@ -180,17 +181,15 @@ def compose_faster() -> None:
     from omegaconf.base import Box
 
     choices, tell, load = defaults_list._create_interpolation_map, Box._re_parent, ConfigRepository.load_config
-    loaded: dict[str, Any] = {}
+    loaded: dict[str, bytes] = {}
 
     def once(repository: ConfigRepository, config_path: str) -> Any:
         source = repository._find_object_source(config_path, ObjectType.CONFIG)
         if source is None or source.path not in (CONF, "hydra.conf"):
             return load(repository, config_path)
         if config_path not in loaded:
-            loaded[config_path] = load(repository, config_path)
-        found = copy(loaded[config_path])
-        found.config = deepcopy(found.config)  # which the composition changes
-        return found
+            loaded[config_path] = pickle.dumps(load(repository, config_path))
+        return pickle.loads(loaded[config_path])  # as the composition changes it
 
     def if_needed(overrides: Any, entries: list[Any], self_added: bool) -> Any:
         return choices(overrides, entries, self_added) if any(each.is_interpolation() for each in entries) else None
@@ -208,6 +207,7 @@ def compose_faster() -> None:
 
     yaml.SafeLoader = yaml.CSafeLoader
     patch.object(ConfigRepository, "load_config", once).start()
+    patch.object(ConfigRepository, "__deepcopy__", lambda repository, memo: copy(repository), create=True).start()
     patch.object(defaults_list, "_create_interpolation_map", if_needed).start()
     patch.object(Box, "_re_parent", if_new).start()
 
