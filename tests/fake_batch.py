@@ -47,6 +47,9 @@ class Motions:
         return np.lib.stride_tricks.sliding_window_view(self.actions, length, 0).transpose(0, 2, 1)
 
 
+MOTIONS = Motions()
+
+
 def make_batch(frames: int, chunk: int = 1, size: int = 4, spec: Spec = SPEC) -> dict[str, Any]:
     """A batch of `size` windows with random images and actions, and sentences that differ."""
     low, high = torch.tensor(spec.low), torch.tensor(spec.high)
@@ -66,6 +69,13 @@ def make_batch(frames: int, chunk: int = 1, size: int = 4, spec: Spec = SPEC) ->
 def with_text(model: Model, batch: dict[str, Any]) -> dict[str, Any]:
     """The batch with its sentences as tokens, as the learner hands it over."""
     return {**batch, "text": model.text.tokenize(batch["instruction"])}
+
+
+def with_motions(model: Model) -> dict[str, Any]:
+    """A batch of noise for a model, with motions as labels."""
+    batch, chunks = with_text(model, make_batch(model.history, model.chunk)), MOTIONS.chunks(model.chunk)
+    rows = np.random.default_rng(0).integers(len(chunks), size=(4, model.history))
+    return {**batch, "action": torch.from_numpy(chunks[rows])}
 
 
 def context_of(option: str, **changes: Any) -> Callable[..., Any]:

@@ -47,11 +47,11 @@ class Seen(LightningModule):
         return torch.optim.Adam(self.parameters(), lr=0.1)
 
 
-def fit(folder: Path, steps: int, devices: int = 1) -> Seen:
+def fit(folder: Path, steps: int) -> Seen:
     model = Seen()
     trainer = Trainer(
         accelerator="cpu",
-        devices=devices,
+        devices=1,
         max_steps=steps,
         val_check_interval=4,
         check_val_every_n_epoch=None,

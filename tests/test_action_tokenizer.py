@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from defaults import defaults_of
-from fake_batch import Motions
+from fake_batch import MOTIONS, Motions
 from saved_policies import save_policy
 from toy import SPEC
 
@@ -137,8 +137,7 @@ def test_what_actions_lose_as_tokens_is_a_share_of_their_range() -> None:
     assert rounding(fine, BOUNDS.chunks(1), SPEC)[1] < 0.002
 
 
-MOTIONS = Motions()
-CHUNKS = MOTIONS.chunks(8)
+CHUNKS = torch.from_numpy(MOTIONS.chunks(8).copy())
 
 
 KINDS: dict[str, Callable[..., ActionTokenizer]] = {
@@ -154,7 +153,7 @@ every = pytest.mark.parametrize("name", KINDS)
 @every
 def test_a_chunk_survives_as_a_sequence(name: str) -> None:
     tokenizer = EVERY[name]
-    chunks = torch.from_numpy(CHUNKS[:6].copy()).view(2, 3, 8, 3)
+    chunks = CHUNKS[:6].view(2, 3, 8, 3)
     tokens = tokenizer.tokenize(chunks)
     assert tokens.shape[:2] == (2, 3) and tokens.dtype == torch.int64
     assert tokens.shape[2] == tokenizer.length(8) or (name == "fast" and tokens.shape[2] < tokenizer.length(8))
@@ -166,9 +165,9 @@ def test_a_chunk_survives_as_a_sequence(name: str) -> None:
 @every
 def test_what_the_round_trip_costs_on_small_motions_at_10_hz(name: str) -> None:
     tokenizer = EVERY[name]
-    error = tokenizer.detokenize(tokenizer.tokenize(torch.from_numpy(CHUNKS.copy()))).numpy() - CHUNKS
-    mean = 1000 * np.abs(error[..., :2]).mean()  # [mm]
-    bias = 1000 * np.abs(error[..., :2].mean((0, 1))).max()
+    error = tokenizer.detokenize(tokenizer.tokenize(CHUNKS)) - CHUNKS
+    mean = 1000 * error[..., :2].abs().mean()  # [mm]
+    bias = 1000 * error[..., :2].mean((0, 1)).abs().max()
     least, most, most_bias = {
         "uniform": (0.02, 0.15, 0.02),
         "rt1": (3.0, 5.0, 5.0),  # bins of 8 mm, and always rounded down
@@ -176,8 +175,8 @@ def test_what_the_round_trip_costs_on_small_motions_at_10_hz(name: str) -> None:
         "fast": (0.1, 0.6, 0.02),
     }[name]
     assert least < mean < most and bias < most_bias
-    assert np.abs(error[..., :2]).max() < 0.009, "no tail is cut off"
-    assert np.abs(error[..., 2]).mean() < 0.02
+    assert error[..., :2].abs().max() < 0.009, "no tail is cut off"
+    assert error[..., 2].abs().mean() < 0.02
 
 
 @every
@@ -186,35 +185,32 @@ def test_a_policy_brings_all_that_was_fitted(name: str, tmp_path: Path) -> None:
     fresh = KINDS[name](spec=SPEC)
     save_policy(tmp_path, {"task": {}, "tokenizer": {}, "model": {}}, state=tokenizer.state_dict())
     read_policy(tmp_path).restore(fresh)
-    chunks = torch.from_numpy(CHUNKS[::50].copy())
-    tokens = tokenizer.tokenize(chunks)
-    assert torch.equal(fresh.tokenize(chunks), tokens)
+    tokens = tokenizer.tokenize(CHUNKS[::50])
+    assert torch.equal(fresh.tokenize(CHUNKS[::50]), tokens)
     assert torch.equal(fresh.detokenize(tokens), tokenizer.detokenize(tokens))
 
 
 @every
 def test_fitting_twice_gives_the_same_and_so_does_a_copy(name: str) -> None:
-    chunks = torch.from_numpy(CHUNKS.copy())
     for again in (KINDS[name](spec=SPEC, statistics=MOTIONS), deepcopy(EVERY[name])):
-        assert torch.equal(again.tokenize(chunks), EVERY[name].tokenize(chunks))
+        assert torch.equal(again.tokenize(CHUNKS), EVERY[name].tokenize(CHUNKS))
 
 
 def test_what_lies_beyond_the_bounds_is_counted() -> None:
     tokenizer = Uniform(spec=SPEC, statistics=BOUNDS, **defaults_of("tokenizer/uniform"))
     chunks = BOUNDS.chunks(1).copy()
     assert out_of_bounds(tokenizer, chunks) == 0
-    assert all(out_of_bounds(fitted, CHUNKS) == 0 for fitted in EVERY.values())
+    assert all(out_of_bounds(fitted, CHUNKS.numpy()) == 0 for fitted in EVERY.values())
     chunks[0, 0, 0] = 9.0
     assert out_of_bounds(tokenizer, chunks) == pytest.approx(1 / chunks.size)
 
 
 def test_tokens_are_drawn_from_the_targets() -> None:
     soft, hard = Uniform(spec=SPEC, statistics=MOTIONS, **defaults_of("tokenizer/uniform")), EVERY["quantile"]
-    chunks = torch.from_numpy(CHUNKS.copy())
-    tokens = soft.tokenize(chunks)
-    off = (soft.sampled(tokens, chunks) - tokens)[:, :2].double()
+    tokens = soft.tokenize(CHUNKS)
+    off = (soft.sampled(tokens, CHUNKS) - tokens)[:, :2].double()
     assert off.std().item() == pytest.approx(3.0, rel=0.1) and abs(off.mean().item()) < 0.2
-    assert torch.equal(hard.sampled(tokens, chunks), tokens)
+    assert torch.equal(hard.sampled(tokens, CHUNKS), tokens)
 
 
 def test_quantile_bins_hold_as_many_actions_each_and_are_read_as_their_mean() -> None:

@@ -3,32 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from defaults import defaults_of
-from fake_batch import Motions, as_policy, make_batch, make_decoder, make_rt1, with_text
-from small_training import loader, make_learner, make_trainer, save
-from toy import SPEC, ToyEnvironment
+from fake_batch import MOTIONS, make_decoder, make_rt1, with_motions
+from toy import SPEC
 
 from vla.models.decoder import Decoder
 from vla.models.model import Model
-from vla.models.policy_folder import read_policy
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile
 from vla.models.tokenizers.tokenizer import RT1Bins
-from vla.rollouts.rollout import rollout
-
-MOTIONS = Motions()
 
 
-def make_fast(chunk: int = 4, seed: int = 0) -> Decoder:
+def make_fast() -> Decoder:
     """A decoder that writes chunks as FAST does."""
-    torch.manual_seed(seed)
-    return make_decoder(chunk=chunk, tokenizer=Fast(bins=256, chunk=chunk, spec=SPEC, statistics=MOTIONS, scale=10.0))
+    return make_decoder(chunk=4, tokenizer=Fast(bins=256, chunk=4, spec=SPEC, statistics=MOTIONS, scale=10.0))
 
 
 MODELS: dict[str, Callable[[], Decoder]] = {
@@ -38,25 +29,16 @@ MODELS: dict[str, Callable[[], Decoder]] = {
     "quantile": lambda: make_decoder(tokenizer=Quantile(bins=64, spec=SPEC, statistics=MOTIONS)),
     "fast": make_fast,
 }
-every_model = pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
 
 
-def batch_for(model: Decoder, size: int = 4) -> dict[str, Any]:
-    """A batch of noise, with motions as labels."""
-    batch = with_text(model, make_batch(model.history, model.chunk, size))
-    chunks = MOTIONS.chunks(model.chunk)
-    rows = np.random.default_rng(0).integers(len(chunks), size=(size, model.history))
-    return {**batch, "action": torch.from_numpy(chunks[rows])}
-
-
-@every_model
+@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
 def test_writing_with_a_cache_is_decoding_the_growing_sequence_again_and_again(make: Callable[[], Decoder]) -> None:
     model = make()
     with torch.no_grad():
         for parameter in model.parameters():  # many biases are 0 at first, and would not be missed
             parameter.add_(0.3 * torch.randn_like(parameter))
     model.eval()
-    batch = batch_for(model)
+    batch = with_motions(model)
     batch["present"][:2, :-1] = False
     with torch.inference_mode():
         context = model.encoded(batch)
@@ -72,7 +54,7 @@ def test_writing_with_a_cache_is_decoding_the_growing_sequence_again_and_again(m
 
 def test_a_token_depends_on_those_before_it_and_on_no_later_one() -> None:
     model = make_decoder(chunk=2).eval()
-    context = model.encoded(batch_for(model))
+    context = model.encoded(with_motions(model))
     tokens = torch.randint(64, (4, 5))
     embedded: list[torch.Tensor] = []
 
@@ -90,7 +72,7 @@ def test_a_token_depends_on_those_before_it_and_on_no_later_one() -> None:
 
 def test_every_frame_matters() -> None:
     model = make_decoder(history=3).eval()
-    batch = batch_for(model)
+    batch = with_motions(model)
     logits = model(batch)["logits"]
     for frame in range(3):
         changed = {name: images.clone() for name, images in batch["rgb"].items()}
@@ -100,7 +82,7 @@ def test_every_frame_matters() -> None:
 
 def test_frames_that_are_missing_are_as_frames_that_are_padding() -> None:
     model = make_decoder(history=3).eval()
-    batch = batch_for(model)
+    batch = with_motions(model)
     batch["present"][:, :2] = False
     alone = {name: batch[name][:, 2:] for name in ("state", "present")}
     rgb = {camera: images[:, 2:] for camera, images in batch["rgb"].items()}
@@ -113,22 +95,8 @@ def test_writing_ends_when_all_have_ended() -> None:
     torch.nn.init.zeros_(model.head.weight)
     with torch.no_grad():
         model.head.bias.copy_(torch.eye(256)[model.tokenizer.end])
-    _, tokens = model.generate(model.encoded(batch_for(model)))
+    _, tokens = model.generate(model.encoded(with_motions(model)))
     assert tokens.tolist() == [[model.tokenizer.end]] * 4
-
-
-def test_a_trained_decoder_of_fast_tokens_plays_an_episode_from_its_checkpoint(tmp_path: Path) -> None:
-    model = make_fast(chunk=4)
-    trainer = make_trainer(3)
-    learner = make_learner(model)
-    trainer.fit(learner, loader(learner, [make_batch(2, chunk=4)] * 3))
-    save(trainer, tmp_path, "policy")
-    restored = make_decoder(chunk=4, tokenizer=Fast(bins=256, chunk=4, spec=SPEC, scale=10.0))
-    read_policy(tmp_path / "policy").restore(restored)
-    episode = rollout(ToyEnvironment(), as_policy(restored), seed=3)
-    assert episode.actions.shape == (40, 3)
-    expected = rollout(ToyEnvironment(), as_policy(model), seed=3)
-    assert episode.actions == pytest.approx(expected.actions, abs=1e-6)
 
 
 @pytest.mark.parametrize("make", [make_decoder, make_rt1])

@@ -18,8 +18,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from vla.models.model import Model
 
-MODELS = ALL | {"rt1": partial(make_rt1, proprioception=True)}
-VLAS = {"smolvla": make_smolvla, **{name: partial(make_policy, name) for name in KINDS}}
+DENOISING = {name: partial(ALL[name], steps=2) for name in ("diffusion", "flow")}
+MODELS = {**ALL, **DENOISING, "rt1": partial(make_rt1, proprioception=True)}
+VLAS = {"smolvla": partial(make_smolvla, steps=2), **{name: partial(make_policy, name, steps=2) for name in KINDS}}
 
 
 class Call(nn.Module):

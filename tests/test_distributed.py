@@ -12,7 +12,6 @@ import toy
 import warm
 from command_line import SMALL, vla
 from defaults import defaults_of
-from reading import windows
 from resuming import STOP, same
 from together import PAIRS, TRUNK, composed, train, train_trunk, untrained
 from trunk import make_trunk_model
@@ -28,7 +27,7 @@ TORCHRUN = {"TORCHELASTIC_RUN_ID": "1", "RANK": "0", "LOCAL_RANK": "0", "WORLD_S
 
 @pytest.fixture(scope="module")
 def together(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where two processes have left what they trained and saw."""
+    """Where two processes have left what they trained."""
     left = tmp_path_factory.mktemp("together")
     warm.run_together(left, "together", str(folder), str(left))
     return left
@@ -95,16 +94,6 @@ def test_two_processes_go_on_with_the_same_bits(together: Path) -> None:
     for part in ("state_dict", "current_model_state", "optimizer_states"):
         assert same(whole[part], rest[part]), part
     assert not same(whole["state_dict"], half["state_dict"])
-
-
-def test_two_processes_of_a_trainer_see_every_window_once_between_them(folder: Path, together: Path) -> None:
-    module = windows(folder)
-    count = len(module.training_windows)
-    seen = np.stack([np.load(together / f"seen{rank}.npy") for rank in (0, 1)], axis=1)  # (steps, 2, B, …)
-    drawn = seen.reshape(np.prod(seen.shape[:3]), -1)[:count]
-    every = module.make_batch(module.training_windows)["state"].numpy().reshape(count, -1)
-    assert len(np.unique(every, axis=0)) == count  # no two windows look alike
-    np.testing.assert_array_equal(np.unique(drawn, axis=0), np.unique(every, axis=0))
 
 
 @pytest.mark.parametrize(

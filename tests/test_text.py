@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from typing import Any
 
 import pytest
@@ -32,15 +30,13 @@ def test_tokens_are_filled_up_and_the_filling_changes_nothing() -> None:
     assert encoder(together).shape == (3, 8) and torch.isfinite(encoder(together)).all()
 
 
-def test_tokens_are_the_same_in_every_process_whatever_the_case_but_not_the_order() -> None:
+def test_tokens_are_the_same_everywhere_and_always_whatever_the_case_but_not_the_order() -> None:
     encoder = NGrams(width=8, **defaults_of("model/text/ngrams", dropout=0.0))
     plain, loud, swapped = encoder.tokenize(["red on blue", "Red on BLUE!", "blue on red"])
     assert torch.equal(plain, loud)
     assert set(plain.tolist()) != set(swapped.tolist())
-    program = "from vla.models.text.ngrams import NGrams; encoder = NGrams(4096, 3, 0.0, None, False, {}, width=4)"
-    program += "; print(encoder.tokenize(['red on blue'])[0].tolist())"
-    elsewhere = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert elsewhere.strip() == str(plain.tolist())
+    known = [1696, 1333, 3775, 777, 1693, 1191, 1135, 2078, 2083, 1766, 3758, 4090, 3394, 154, 2182]
+    assert plain.tolist() == known
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_batch_normalisation_over_processes_keeps_the_activations() -> None:
         assert torch.allclose(SyncBatchNorm().apply(network)(images, text), expected, atol=1e-5)
 
 
-NETWORKS = [("test_vit", 32), ("test_resnet", None), ("test_vit4", None), ("vit_base_patch16_siglip_224", 32)]
+NETWORKS = [("test_vit", 32), ("test_resnet", None), ("test_vit3", 32), ("test_vit4", None)]
 
 
 @pytest.mark.parametrize(("name", "size"), NETWORKS)

@@ -11,7 +11,6 @@ from typing import Any
 
 import composing
 import lightning
-import numpy as np
 import reading
 import resuming
 import torch
@@ -116,15 +115,8 @@ def train_in_pieces(store: Path, folder: Path) -> None:
         resuming.train(model, store, folder / name, stop, checkpoint, devices=2, strategy="ddp")
 
 
-def see_windows(store: Path, folder: Path) -> None:
-    """Leave what this process saw while the two saw every window once."""
-    steps = -(-len(reading.windows(store).training_windows) // (8 * 2))
-    model = reading.fit(store, steps, devices=2)
-    np.save(folder / f"seen{model.global_rank}.npy", np.stack([seen.numpy() for seen in model.seen]))
-
-
 if __name__ == "__main__":
     torch.set_num_threads(1)
     store, folder = Path(sys.argv[1]), Path(sys.argv[2])
-    for leave in (train_pairs, train_trunks, train_in_pieces, see_windows):
+    for leave in (train_pairs, train_trunks, train_in_pieces):
         leave(store, folder)

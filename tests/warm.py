@@ -19,7 +19,6 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from copy import copy
 from pathlib import Path
 from select import select
 from socket import AF_UNIX, create_server, socket
@@ -180,6 +179,9 @@ def compose_faster() -> None:
     from hydra.core.object_type import ObjectType
     from omegaconf.base import Box
 
+    from vla.config.compose import copy_less
+
+    copy_less()
     choices, tell, load = defaults_list._create_interpolation_map, Box._re_parent, ConfigRepository.load_config
     loaded: dict[str, bytes] = {}
 
@@ -207,7 +209,6 @@ def compose_faster() -> None:
 
     yaml.SafeLoader = yaml.CSafeLoader
     patch.object(ConfigRepository, "load_config", once).start()
-    patch.object(ConfigRepository, "__deepcopy__", lambda repository, memo: copy(repository), create=True).start()
     patch.object(defaults_list, "_create_interpolation_map", if_needed).start()
     patch.object(Box, "_re_parent", if_new).start()
 

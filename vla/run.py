@@ -25,7 +25,7 @@ from yaml import YAMLError
 from vla import jobs
 from vla.config.annotations import packages, targets
 from vla.config.check import check, devices
-from vla.config.compose import CONF, offer_axes, substitutes, with_variant
+from vla.config.compose import CONF, copy_less, offer_axes, substitutes, with_variant
 from vla.config.compose import compose as compose_again
 from vla.config.experiment import Experiment
 from vla.config.packages import config_folders, offer_options, trust
@@ -292,6 +292,7 @@ def main() -> None:
         _require_ranks()
         offer_options()
         offer_axes()
+        copy_less()
         _compose()
     except KeyboardInterrupt:
         sys.exit(130)

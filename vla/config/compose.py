@@ -6,10 +6,12 @@ import json
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from functools import cache
 from typing import Any
 
 import hydra
+from hydra._internal.config_repository import ConfigRepository
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -25,6 +27,11 @@ from vla.io.documents import read_yaml
 from vla.io.errors import UserError, suggestion
 
 log = logging.getLogger(__name__)
+
+
+def copy_less() -> None:
+    """Let Hydra copy what knows its folders as little as it has to: it does so for every group that `--help` lists."""
+    ConfigRepository.__deepcopy__ = lambda repository, memo: copy(repository)  # type: ignore[attr-defined]
 
 
 def compose(*overrides: str) -> DictConfig:
