@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from vla.config.build import build
 from vla.rollouts.rollout import rollout
-from vla.spec import Array, Observation, Spec
+from vla.spec import Array, Episode, Observation, Spec
 from vla.tasks.perturb import Perturbation, Perturbed
 from vla.tasks.tabletop.expert import Waypoint
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 QUIET = {"start": 0.0, "noise": 0.0, "rate": 0.0, "unturned": 0.0, "missed": 0.0}
-# Of 24 episodes, three standard deviations below the shares of 48 that succeeded: 36 pushes, 41 stacks, at least 44 of
-# each other goal. Which ones do differs between processors, whose physics round differently.
-RECOVERED = {"push": 12, "stack": 15}
-GOALS = ("lift", "pick_place", "pick_place_two", "push", "stack", "stay", "wait")
+# Goal → of so many episodes so many succeed, three standard deviations below the shares of 48 that did: 36 pushes, 41
+# stacks, at least 44 of each other goal. Which ones do differs between processors, whose physics round differently.
+RECOVERED = {"push": (24, 12), "stack": (24, 15), "pick_place": (24, 18)}
+GOALS = (*RECOVERED, "lift", "pick_place_two", "stay", "wait")  # parts of which the others have, too
 
 
 def perturbed(spec: Spec, **changes: Any) -> Perturbed:
@@ -43,9 +43,10 @@ def test_the_expert_solves_every_goal_even_when_it_is_led_astray(goal: str) -> N
     with environment.blind():
         assert sum(rollout(environment, Waypoint(spec), seed).success for seed in range(8)) >= 7
         led_astray = perturbed(spec, noise=0.3)
-        episodes = [rollout(environment, led_astray, seed) for seed in range(24)]
+        count, recovered = RECOVERED.get(goal, (12, 9))
+        episodes = [rollout(environment, led_astray, seed) for seed in range(count)]
     environment.close()
-    assert sum(episode.success for episode in episodes) >= RECOVERED.get(goal, 18)
+    assert sum(episode.success for episode in episodes) >= recovered
     for actions in (episodes[0].actions, episodes[0].executed):
         assert (np.array(spec.low, np.float32) <= actions).all() and (actions <= np.array(spec.high, np.float32)).all()
     for observation, action in zip(episodes[0].observations, episodes[0].actions, strict=True):
@@ -129,22 +130,31 @@ def test_without_the_simulators_truth_the_expert_says_so(tabletop: Tabletop) -> 
         Waypoint(tabletop.spec).act(observation)
 
 
+TOY: Any = {
+    **{**QUIET, "tool": "point", "move": ("x", "y"), "turn": None, "gripper": "gripper"},
+    **{"start": 1.0, "start_steps": (3, 3), "steps": (2, 5), "closed": 0.5, "pace": (1.0, 1.0)},
+}
+
+
+def in_the_toy_world(spec: Spec, expert: type[toy.ToyExpert], **changes: Any) -> Episode:
+    """An episode of an expert that is perturbed as `TOY` says, with changes, away to a corner."""
+    perturb = Perturbation((5.0, 5.0), (5.0, 5.0), **TOY | changes)  # further away than any step goes
+    return rollout(toy.ToyEnvironment(spec=spec), Perturbed(spec, lambda spec: expert(noise=0.0), perturb), 0)
+
+
 @pytest.mark.parametrize("gripper", [0.0, 1.0])
 def test_any_expert_is_perturbed_in_the_components_that_are_named(gripper: float) -> None:
     """The toy world has two dimensions and no turn."""
-    names: Any = {"tool": "point", "move": ("x", "y"), "turn": None, "gripper": "gripper"}
-    corner = (5.0, 5.0)  # further away than any step goes
-    names |= QUIET | {"start": 1.0, "start_steps": (3, 3), "steps": (2, 5), "closed": 1 - gripper, "pace": (1.0, 1.0)}
-    perturb = Perturbation(corner, corner, **names)
-    expert = Perturbed(toy.SPEC, lambda spec: toy.ToyExpert(noise=0.0), perturb)
-    episode = rollout(toy.ToyEnvironment(), expert, 0)
+    episode = in_the_toy_world(toy.SPEC, toy.ToyExpert, closed=1 - gripper)
     np.testing.assert_allclose(episode.executed[:3], np.tile([0.05, 0.05, gripper], (3, 1)))
     np.testing.assert_array_equal(episode.executed[3:], episode.actions[3:])
+
+
+def test_components_that_are_not_there_are_named() -> None:
     with pytest.raises(ValueError, match=r"tool=hand is no point of 2 coordinates in the truth, which has target"):
-        elsewhere = Perturbation(corner, corner, **names | {"tool": "hand"})
-        rollout(toy.ToyEnvironment(), Perturbed(toy.SPEC, lambda spec: toy.ToyExpert(noise=0.0), elsewhere), 0)
+        in_the_toy_world(toy.SPEC, toy.ToyExpert, tool="hand")
     with pytest.raises(ValueError, match=r"names dz; actions have x, y, gripper"):
-        Perturbation((0, 0, 0), corner + corner[:1], **names | {"move": ("x", "y", "dz")}).reset(toy.SPEC, 0)
+        Perturbation((0, 0, 0), (5, 5, 5), **TOY | {"move": ("x", "y", "dz")}).reset(toy.SPEC, 0)
 
 
 class Walker(toy.ToyExpert):
@@ -158,12 +168,7 @@ class Walker(toy.ToyExpert):
 def test_an_expert_without_a_gripper_is_perturbed_and_misses_no_grasp() -> None:
     ends: Any = {name: getattr(toy.SPEC, name)[:2] for name in ("action", "units", "low", "high")}
     spec = dataclasses.replace(toy.SPEC, **ends)
-    names: Any = {"tool": "point", "move": ("x", "y"), "turn": None, "gripper": None}
-    names |= QUIET | {"start": 1.0, "start_steps": (3, 3), "steps": (2, 5), "closed": 0.5, "pace": (0.5, 0.5)}
-    expert = Perturbed(
-        spec, lambda spec: Walker(noise=0.0), Perturbation((5.0, 5.0), (5.0, 5.0), **names | {"missed": 1.0})
-    )
-    episode = rollout(toy.ToyEnvironment(spec=spec), expert, 0)
+    episode = in_the_toy_world(spec, Walker, gripper=None, pace=(0.5, 0.5), missed=1.0)
     assert episode.success and episode.executed.shape[1] == 2
     np.testing.assert_allclose(episode.executed[:3], np.full((3, 2), 0.05))
     np.testing.assert_allclose(episode.executed[3:], episode.actions[3:] * 0.5)

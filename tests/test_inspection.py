@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from collecting import content
-from command_line import SMALL, here
+from command_line import SMALL
+from composing import composed
 from toy import ARM_SPEC, make_arm, make_environment, make_expert
 from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, flip
 
+from vla.config.experiment import Experiment
 from vla.config.nodes import Inspection
 from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
@@ -25,17 +25,11 @@ from vla.data.header import Codec
 from vla.data.index import listed
 from vla.data.verification import find_episode, require_whole, verify_store
 from vla.io.errors import UserError
-from vla.jobs.inspect import inspect_store, replay_episode
+from vla.jobs.collect import demonstrations
+from vla.jobs.inspect import inspect_store, replay_episode, run
 from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.spec import Episode
-
-
-def of_another_task(folder: Path, episodes: list[Episode]) -> EpisodeStore:
-    add(folder, episodes)
-    header = json.loads((folder / "store.json").read_text())
-    (folder / "store.json").write_text(json.dumps({**header, "config": {"task": {"size": 2.0}}}))
-    return EpisodeStore(folder)
 
 
 def test_a_whole_store_is_described(tmp_path: Path) -> None:
@@ -58,10 +52,6 @@ def replaced(old: bytes, new: bytes) -> Callable[[Path], object]:
     return of_index(lambda data: data.replace(old, new, 1))
 
 
-def shorten(folder: Path) -> None:
-    os.truncate(folder / "state.bin", (folder / "state.bin").stat().st_size - 1)
-
-
 def poison(folder: Path) -> None:
     shutil.rmtree(folder)
     store, seen = add(folder, []), EPISODES[0].observations
@@ -71,7 +61,7 @@ def poison(folder: Path) -> None:
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], list[int], str]] = {
     "a changed bit": (lambda folder: change(folder / "rgb_front.bin", lambda data: flip(data, 0)), [0], "rows changed"),
-    "a short file": (shorten, [4], "rows changed"),
+    "a short file": (lambda folder: change(folder / "state.bin", lambda data: data[:-1]), [4], "rows changed"),
     "a missing file": (lambda folder: (folder / "depth_wrist.bin").unlink(), [0, 1, 2, 4], "rows changed"),
     "a garbled line": (replaced(b'"seed": 1,', b'"seed": 1\0'), [1], "no readable line"),
     "a lost line end": (replaced(b'\n{"seed": 2', b'\t{"seed": 2'), [1, 2], "no readable line"),
@@ -135,12 +125,13 @@ def test_copies_with_different_damage_make_a_whole_one(tmp_path: Path) -> None:
 
 
 def test_stores_of_several_configs_keep_them_apart(tmp_path: Path) -> None:
-    first, second = add(tmp_path / "first", EPISODES[:2]), of_another_task(tmp_path / "second", EPISODES[1:3])
-    derive_store([first, second], tmp_path / "merged")
+    first, second = add(tmp_path / "first", EPISODES[:2]), add(tmp_path / "second", EPISODES[1:3])
+    change(second.folder / "store.json", lambda data: data.replace(b'"size": 1.0', b'"size": 2.0'))
+    derive_store([first, EpisodeStore(second.folder)], tmp_path / "merged")
     merged = EpisodeStore(tmp_path / "merged")
     require_whole(verify_store(merged))
     assert [entry.seed for entry in merged.episodes] == [0, 1, 1, 2]
-    assert find_episode(merged, 0)[0] == CONFIG and find_episode(merged, 2)[0] == {"task": {"size": 2.0}}
+    assert find_episode(merged, 0)[0] == CONFIG and find_episode(merged, 2)[0] == {**CONFIG, "task": {"size": 2.0}}
     with pytest.raises(ValueError, match="has 2 episodes of seed 1: inspect one of the stores"):
         find_episode(merged, 1)
     add(tmp_path / "third", MORE[6:7])
@@ -273,16 +264,21 @@ def test_the_job_describes_what_is_damaged_and_repairs_it_beside_it(
         inspect(store.folder, repair=True)
 
 
-def test_a_store_that_was_put_together_is_of_a_task_as_any_other(tmp_path: Path) -> None:
-    collected = (*SMALL, "job=collect", "collect.episodes=2")
-    here(tmp_path, *collected, "collect.folder=all")
-    here(tmp_path, "job=inspect", "inspect.folder=all", "inspect.where={seed: [0, 9]}", "inspect.into=chosen")
-    chosen = (*collected, "collect.folder=chosen")
-    assert "chosen was derived" not in here(tmp_path, *chosen).stdout
-    other = here(tmp_path, *chosen, "task/goal=lift").stdout
-    assert "chosen was derived from demonstrations with another task" in other
-    refused = here(tmp_path, *chosen, "task.image_size=[64,64]", ok=False).stderr
-    assert "the episode store chosen has image_size = " in refused and "the task has" in refused
+def test_a_store_that_was_put_together_is_of_a_task_as_any_other(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def collected(name: str, *overrides: str) -> None:
+        asked = ("job=collect", f"collect.folder={tmp_path / name}", *SMALL, "collect.episodes=1", *overrides)
+        demonstrations(Experiment.of(composed(*asked)))
+
+    collected("all")
+    inspect(tmp_path / "all", where={"seed": [0, 9]}, into=str(tmp_path / "chosen"))
+    collected("chosen")
+    assert "chosen was derived" not in caplog.text
+    collected("chosen", "task.time_limit=6")
+    assert "chosen was derived from demonstrations with another task" in caplog.text
+    with pytest.raises(UserError, match=r"the episode store .*chosen has image_size = .* the task has"):
+        collected("chosen", "task.image_size=[64,64]")
 
 
 def test_the_job_merges_and_refuses_what_contradicts_itself(tmp_path: Path) -> None:
@@ -294,8 +290,8 @@ def test_the_job_merges_and_refuses_what_contradicts_itself(tmp_path: Path) -> N
         with pytest.raises(ValueError, match=r"give its folder, inspect\.into=DIR"):
             inspect(tmp_path, **asked)
     for option in ("inspect.repair=true", "inspect.into=there"):
-        refused = here(tmp_path, "job=inspect", "inspect.episode=7", option, ok=False).stderr
-        assert f"omit {option.partition('=')[0]}" in refused
+        with pytest.raises(ValueError, match=f"omit {option.partition('=')[0]}"):
+            run(Experiment.of(composed("job=inspect", "inspect.episode=7", option)))
     store = EpisodeStore.create_or_open(tmp_path / "store", ARM_SPEC, {})
     with store.writing():
         store.append(EPISODES[0])

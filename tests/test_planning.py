@@ -14,14 +14,7 @@ from rich import get_console
 from scipy.stats import binom, multinomial
 
 from vla.rollouts.comparison import fisher, mcnemar
-from vla.rollouts.planning import (
-    MOST,
-    episodes_needed,
-    power_for_bar,
-    power_of_pairs,
-    power_of_samples,
-    stopping,
-)
+from vla.rollouts.planning import MOST, episodes_needed, power_for_bar, power_of_pairs, power_of_samples, stopping
 from vla.rollouts.sequential import excludes
 from vla.rollouts.statistics import wilson_interval
 

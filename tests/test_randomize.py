@@ -14,6 +14,7 @@ from vla.config.compose import axes
 from vla.spec import Array
 from vla.tasks.tabletop.environment import Tabletop
 from vla.tasks.tabletop.randomize.blocks import Colours, Distractors, Masses, Placement, Shapes
+from vla.tasks.tabletop.randomize.robot import Latency
 from vla.tasks.world import Streams
 
 DEFAULT = {"distractors", "colour", "size", "mass", "friction", "placement", "arm", "light", "camera", "table"}
@@ -118,8 +119,6 @@ def test_every_shape_stands_on_the_table_and_weighs_what_its_volume_says() -> No
 
 
 def test_commands_reach_the_motors_late(tabletop: Tabletop) -> None:
-    from vla.tasks.tabletop.randomize.robot import Latency
-
     up = np.array([0, 0, 0.04, 0, 0, 0, 1.0])
     task = tabletop.simulation
     kept, heights = task.randomize, []

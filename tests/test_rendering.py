@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from conftest import make_tabletop
 from gallery import compiled, gallery
+from toy_episodes import flip
 
 from vla import jobs
 from vla.config.compose import compose as compose_config
@@ -54,6 +55,12 @@ def grey_levels(first: Array, second: Array) -> Array:
     return np.abs(first.astype(int) - second).mean(axis=(1, 2, 3))
 
 
+def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """What a program does in a process of its own."""
+    settings = {**os.environ, **environment}
+    return subprocess.run([sys.executable, "-c", code], env=settings, capture_output=True, text=True)
+
+
 def drawn(choice: RendererFactory, model: mujoco.MjModel, data: mujoco.MjData, views: Views) -> tuple[Array, Array]:
     """Return the pictures and depths that a renderer draws at once."""
     with closing(choice.open(model, views)) as renderer:
@@ -81,10 +88,10 @@ def start(environment: Tabletop, seed: int, *renderers: Renderer) -> mujoco.MjDa
     return compiled.data
 
 
-def test_pictures_of_a_hundred_scenes_equal_mujocos(wide: tuple[Tabletop, Renderer, ReferenceRenderer]) -> None:
+def test_pictures_of_forty_scenes_equal_mujocos(wide: tuple[Tabletop, Renderer, ReferenceRenderer]) -> None:
     environment, first, second = wide
     differences = []
-    for seed in range(100):
+    for seed in range(40):
         data = start(environment, seed, first, second)
         (rgb, depth), (reference, distance) = first.render(data), second.render(data)
         inside = np.stack([smooth(each) & smooth(other) for each, other in zip(depth, distance, strict=True)])
@@ -166,15 +173,11 @@ def test_a_window_is_a_part_of_what_a_camera_sees(renderer: Fast | Reference) ->
     whole = drawn(renderer, model, data, Views(cameras, 120, 120))[0]
     expected = np.stack([picture[y, x] for picture, y, x in zip(whole, *parts, strict=True)])
     windows = np.array([[y / 120, x / 120, y / 120 + 0.5, x / 120 + 50 / 120] for y, x in zip(top, left, strict=True)])
+    every = np.tile((0.0, 0.0, 1.0, 1.0), (model.ncam, 1))
     with closing(renderer.open(model, Views(cameras, 60, 50, aspect=1.0))) as opened:
-        first, other = opened.render(data, windows)[0], opened.render(data, windows[::-1])[0]
-        again = opened.render(data, windows)[0]
+        np.testing.assert_array_equal(opened.render(data)[0], opened.render(data, every)[0])
+        first, other, again = (opened.render(data, part)[0] for part in (windows, windows[::-1], windows))
     assert grey_levels(first, expected).max() < 0.5 and (first != expected).mean() < 0.05
-    with closing(renderer.open(model, Views(cameras, 60, 50, aspect=1.0))) as opened:
-        everything = opened.render(data)[0]
-        np.testing.assert_array_equal(
-            everything, opened.render(data, np.tile((0.0, 0.0, 1.0, 1.0), (model.ncam, 1)))[0]
-        )
     assert grey_levels(first, other).max() > 5
     np.testing.assert_array_equal(first, again)
 
@@ -311,19 +314,15 @@ def test_workers_take_turns_on_the_gpus_of_a_machine(
 def test_both_renderers_draw_on_the_chosen_device() -> None:
     """There is none of this number, and both say so."""
     for probe in (gl.PROBE, gl.EGL_PROBE):
-        chosen = {"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "99"}
         code = f"from vla.tasks.gl import choose_device; choose_device()\n{probe}"
-        done = subprocess.run(
-            [sys.executable, "-c", code], env={**os.environ, **chosen}, capture_output=True, text=True
-        )
+        done = run(code, MUJOCO_GL="egl", MUJOCO_EGL_DEVICE_ID="99")
         assert done.returncode != 0 and "99" in done.stderr, done.stderr
 
 
 def test_a_software_renderer_is_no_gpu_to_take_turns_on() -> None:
     found = []
     for probe in (gl.DEVICES_PROBE, gl.DEVICES_PROBE.replace('b"software"', 'b"none of these"')):
-        environment = {**os.environ, "MUJOCO_GL": "egl", "LIBGL_ALWAYS_SOFTWARE": "1"}
-        done = subprocess.run([sys.executable, "-c", probe], env=environment, capture_output=True, text=True)
+        done = run(probe, MUJOCO_GL="egl", LIBGL_ALWAYS_SOFTWARE="1")
         assert done.returncode == 0, done.stderr
         found.append({*map(int, done.stdout.split())})
     assert found[0] < found[1]  # that of Mesa is there, and left out
@@ -345,7 +344,7 @@ picture = context.simple_framebuffer((8, 8))
 picture.clear(1.0, 1.0, 1.0)
 assert picture.read()[:3] == b"\\xff\\xff\\xff"
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    done = run(code)
     assert done.returncode == 0, (done.returncode, done.stderr)
 
 
@@ -385,13 +384,7 @@ def test_a_heavy_mesh_is_decimated_once_and_keeps_its_texture(tmp_path: Path, mo
     assert grey_levels(reference, fewer).max() < 5  # without its texture 39
     (kept,) = (tmp_path / "vla" / "meshes").iterdir()
     content = kept.read_bytes()
-    for damage in (
-        content,
-        b"",
-        content[: len(content) // 2],
-        b"[1]",
-        bytes([*content[:400], content[400] ^ 1]) + content[401:],
-    ):
+    for damage in (content, b"", content[: len(content) // 2], b"[1]", flip(content, 400)):
         kept.write_bytes(damage)
         np.testing.assert_array_equal(pictures(fast(faces=2000)), fewer)
         assert kept.read_bytes() == content and [*kept.parent.iterdir()] == [kept]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,21 +14,13 @@ from scipy.special import betaln
 from vla.parallel.pool import Cluster
 from vla.rollouts.comparison import Pairs, compare_pairs
 from vla.rollouts.evaluate import evaluate
-from vla.rollouts.recordings import keep_pictures, merge_recordings
 from vla.rollouts.results import Report, Result
-from vla.rollouts.sequential import (
-    anytime_difference,
-    anytime_interval,
-    anytime_p,
-    excludes,
-    is_decided,
-    log_capital,
-)
+from vla.rollouts.sequential import anytime_difference, anytime_interval, anytime_p, excludes, is_decided, log_capital
 from vla.rollouts.statements import AgainstBar, AgainstRun
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import FIRST_SEED
 
-SIMULATIONS = 10_000
+SIMULATIONS, MOST = 3_000, 150
 SEEDS = range(FIRST_SEED, FIRST_SEED + 60)
 
 
@@ -69,28 +60,24 @@ def test_what_is_decided_agrees_with_the_intervals() -> None:
 
 @pytest.mark.parametrize("bar", [0.5, 0.9])
 def test_a_bar_is_rarely_excluded_by_a_policy_that_is_at_it(bar: float) -> None:
-    random, played = np.random.default_rng(0), np.arange(1, 301)
-    won = np.cumsum(random.random((SIMULATIONS, 300)) < bar, axis=1)
-    excluded, naive = np.zeros((301, 301), bool), np.zeros((301, 301), bool)  # by the numbers won and played
-    for number in played:
-        counts = np.arange(number + 1)
-        excluded[: number + 1, number] = [excludes(bar, int(k), int(number - k)) for k in counts]
-        if number >= 20:
-            ends = [wilson_interval(int(k), int(number)) for k in counts]
-            naive[: number + 1, number] = [not low <= bar <= high for low, high in ends]
-    wrong, often = (table[won, played].any(1).mean() for table in (excluded, naive))
+    won = np.cumsum(np.random.default_rng(0).random((SIMULATIONS, MOST)) < bar, axis=1)
+    excluded, naive = np.zeros((2, MOST + 1, MOST + 1), bool)  # by the numbers won and played
+    for played in range(1, MOST + 1):
+        for count in range(played + 1):
+            low, high = wilson_interval(count, played)
+            excluded[count, played] = excludes(bar, count, played - count)
+            naive[count, played] = played >= 20 and not low <= bar <= high
+    wrong, often = (table[won, np.arange(1, MOST + 1)].any(1).mean() for table in (excluded, naive))
     assert wrong <= 0.05 < 0.2 < often  # an interval for a fixed number errs if it is looked at again and again
 
 
 @pytest.mark.parametrize("lost", [0.04, 0.02])
 def test_policies_that_are_equal_or_a_margin_apart_are_rarely_called_otherwise(lost: float) -> None:
-    random, won, looks = np.random.default_rng(0), 0.04, np.arange(50, 1501, 50)
-    decided, interval = cache(is_decided), cache(anytime_difference)
-    wrong = 0
-    for _ in range(SIMULATIONS):
-        drawn = random.random(1500)
-        counts = (np.cumsum(each)[looks - 1] for each in (drawn < lost, drawn > 1 - won))
-        for one, other, pairs in zip(*(each.tolist() for each in counts), looks.tolist(), strict=True):
+    won, looks = 0.04, range(50, 1501, 50)
+    drawn = np.random.default_rng(0).multinomial(50, [lost, won, 1 - lost - won], (SIMULATIONS, len(looks)))
+    decided, interval, wrong = cache(is_decided), cache(anytime_difference), 0
+    for counts in drawn.cumsum(axis=1)[:, :, :2].tolist():
+        for (one, other), pairs in zip(counts, looks, strict=True):
             if decided(one, other, pairs, 0.02):
                 low, high = interval(one, other, pairs)
                 wrong += not low <= won - lost <= high
@@ -115,18 +102,6 @@ def test_tasks_that_take_turns_are_played_in_whole_rounds() -> None:
     assert report.episodes == 2
     tiers = {"easy": ["reach", "push", "pull"], "hard": ["stack"]}
     assert replace(report, tiers=tiers).mean_over_tiers is None
-
-
-def test_recordings_of_episodes_that_do_not_count_are_removed(tmp_path: Path) -> None:
-    folder = tmp_path / "recordings"
-    until = AgainstBar(0.5).is_decided
-    report = evaluate(
-        toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS, Cluster(2, "beside"), until=until
-    )
-    recorded = merge_recordings(report, folder, tmp_path / "rollouts.rrd", "all")
-    assert sorted(recorded) == [each.seed for each in report.results]
-    keep_pictures(report, folder, "all", recorded)
-    assert [path.name for path in tmp_path.iterdir()] == ["rollouts.rrd"]
 
 
 def test_a_run_is_compared_on_the_episodes_that_both_played() -> None:

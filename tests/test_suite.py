@@ -60,13 +60,8 @@ def test_the_table_and_the_picture_show_every_condition(tmp_path: Path, figures:
 
 
 def test_the_table_tells_who_obeys_and_who_stays_where_both_are_asked_for() -> None:
-    tasks = ("pick_place", "pick_place", "stay")
-    seen = Report(
-        tuple(
-            Result(index, name, task=task)
-            for index, (task, name) in enumerate(zip(tasks, ("success", "dropped", "success"), strict=True))
-        )
-    )
+    played = (("pick_place", "success"), ("pick_place", "dropped"), ("stay", "success"))
+    seen = Report(tuple(Result(index, outcome, task=task) for index, (task, outcome) in enumerate(played)))
     stays = Report(tuple(Result(index, "did_not_stay", task="stay") for index in range(3)))
     told = conditions_table({"seen": seen, "impossible": stays}, {}).rows
     assert [(row[0], row[2]) for row in told] == [

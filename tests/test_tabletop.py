@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+import mujoco
 import numpy as np
 import pytest
 from conftest import make_tabletop
 from replaying import played, same
 
-if TYPE_CHECKING:
-    from vla.tasks.tabletop.environment import Tabletop
+from vla.tasks.tabletop.environment import Tabletop
+from vla.tasks.tabletop.robot import look_at
 
 
 def test_observations_are_what_the_spec_says(tabletop: Tabletop) -> None:
@@ -34,20 +33,16 @@ def test_the_same_seed_and_actions_give_the_same_episode_bit_for_bit(tabletop: T
     fresh.close()
 
 
-def test_depth_is_the_distance_along_the_optical_axis(tabletop: Tabletop) -> None:
+def test_depth_is_the_distance_along_the_optical_axis() -> None:
     """The table, seen through the middle of the image, lies where the camera's geometry puts it."""
     environment = make_tabletop("task/randomize=none")
     environment.reset(0)
     compiled = environment.simulation.compiled
     # Look at bare table, far from everything.
     position, spot = np.array([0.9, -0.6, 0.5]), np.array([0.7, -0.6, 0.0])
-    from vla.tasks.tabletop.robot import look_at
-
     camera = compiled.cameras["front"]
     compiled.model.cam_pos[camera] = position
     quaternion = np.empty(4)
-    import mujoco
-
     mujoco.mju_mat2Quat(quaternion, look_at(position, spot, (0, 0, 1)).ravel())
     compiled.model.cam_quat[camera] = quaternion
     mujoco.mj_forward(compiled.model, compiled.data)
