@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -49,20 +48,23 @@ def moving(steps: int, seed: int, gripper: float = 1.0) -> Array:
     return np.column_stack([np.repeat(direction[None], steps, 0), np.full(steps, gripper)]).astype(np.float32)
 
 
-RESTING = np.array([[0, 0, 0, 0, 0, 0, 1.0]], np.float32)
+def resting(steps: int = 3, gripper: float = 1.0) -> Array:
+    """Actions without a motion (steps, 7)."""
+    return np.repeat(np.array([[0, 0, 0, 0, 0, 0, gripper]], np.float32), steps, 0)
+
 
 SESSION = (
-    Part("waiting", np.repeat(RESTING, 4, 0)),
+    Part("waiting", resting(4)),
     Part("running", moving(20, 0), instruction="put the red block on the pad"),
-    Part("holding", np.repeat(RESTING, 3, 0)),
-    Part("handed over", np.repeat(RESTING, 6, 0), person=True),
+    Part("holding", resting()),
+    Part("handed over", resting(6), person=True),
     Part("handed over", moving(12, 1, gripper=0.0), person=True),
-    Part("handed over", np.repeat(RESTING * 0, 5, 0), person=True),
-    Part("holding", np.repeat(RESTING * 0, 3, 0)),
+    Part("handed over", resting(5, gripper=0.0), person=True),
+    Part("holding", resting(gripper=0.0)),
     Part("running", moving(10, 2, gripper=0.0)),
-    Part("stopped", np.repeat(RESTING * 0, 4, 0)),
+    Part("stopped", resting(4, gripper=0.0)),
     Part("running", moving(8, 3), instruction="lift the blue block"),
-    Part("stopped", np.repeat(RESTING, 3, 0)),
+    Part("stopped", resting()),
 )
 
 
@@ -146,9 +148,3 @@ def write(
         for part in parts:
             session.play(part)
     return folder
-
-
-@cache
-def executed(parts: tuple[int, ...]) -> Array:
-    """The actions in some parts of `SESSION`, one after the other."""
-    return np.concatenate([SESSION[part].actions for part in parts])

@@ -18,8 +18,6 @@ from lifecycle_msgs.msg import Transition
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
-from std_srvs.srv import SetBool
 from world import TOPICS, World
 
 from vla.deploy import actions
@@ -125,11 +123,7 @@ class TrajectoryController(Controller):
             self.end("succeed")
             return self._positions[-1]
         times, positions = [0.0, *self._times], np.vstack([joints, self._positions])
-        place = int(np.searchsorted(times, passed, side="right"))
-        if place == 1:  # on the way to the first point
-            return joints + (positions[1] - joints) * passed / times[1]
-        share = (passed - times[place - 1]) / (times[place] - times[place - 1])
-        return positions[place - 1] + share * (positions[place] - positions[place - 1])
+        return np.array([np.interp(passed, times, each) for each in positions.T])
 
 
 def controlled(world: World) -> TrajectoryController:
@@ -175,14 +169,14 @@ def test_hand_over_cancels_what_is_executed_and_the_arm_is_taken_back_where_it_w
     controller = controlled(world)
     world.start()
     world.live(0.3)
-    assert world.ask(SetBool, "hand_over", SetBool.Request(data=True)).success
+    assert world.hand_over(True).success
     world.live(0.5)
     assert not any(controller.goals[-1].trajectory.points[-1].velocities) and not controller.running
     count, world.joints = len(controller.goals), world.joints + 0.1
     world.live(0.6)
     assert len(controller.goals) == count and world.state is State.HANDED_OVER
     left = world.joints
-    assert world.ask(SetBool, "hand_over", SetBool.Request(data=False)).success
+    assert world.hand_over(False).success
     world.live(5.0, until=lambda: len(controller.goals) > count)
     np.testing.assert_allclose(controller.goals[count].trajectory.points[0].positions, left)
     assert world.becomes(State.RUNNING)
@@ -198,8 +192,7 @@ def test_a_server_that_fails_stops_the_policy_with_its_name_and_the_reason(
 
     def fails(saying: str) -> None:
         world.live(5.0, until=lambda: world.state is State.FAULT)
-        assert world.agent.loop is not None
-        reason = world.agent.loop.reason
+        reason = world.loop.reason
         assert reason.startswith(saying) and "to continue: deactivate and activate" in reason, reason
         world.live(0.2)
         resting = world.joints
@@ -210,7 +203,7 @@ def test_a_server_that_fails_stops_the_policy_with_its_name_and_the_reason(
 
     def goes_on() -> None:
         assert world.change(Transition.TRANSITION_ACTIVATE)
-        world.words.publish(String(data="put the red block on the pad"))
+        world.say("put the red block on the pad")
         assert world.becomes(State.RUNNING)
         world.live(0.3, until=lambda: controller.running)
 
@@ -307,8 +300,8 @@ def test_a_gripper_is_told_once_per_change_and_a_grasp_is_no_error(make_world: C
     told(open_)
     open_.end("abort", **fault)
     assert world.becomes(State.FAULT)
-    assert world.agent.loop is not None and "aborted a goal: " in world.agent.loop.reason
-    assert world.agent.loop.reason.startswith(f"the action server /gripper{'/move' if name == 'franka' else ''}")
+    assert "aborted a goal: " in world.loop.reason
+    assert world.loop.reason.startswith(f"the action server /gripper{'/move' if name == 'franka' else ''}")
 
 
 def undecided(make_world: Callable[..., World]) -> tuple[World, Controller, Controller]:
@@ -334,13 +327,12 @@ def test_a_gripper_that_changes_its_mind_cancels_first(make_world: Callable[...,
 
 def test_after_a_stop_no_goal_of_the_gripper_follows(make_world: Callable[..., World]) -> None:
     world, grasp, move = undecided(make_world)
-    assert world.agent.loop is not None
-    world.agent.loop.stop("by hand")
+    world.loop.stop("by hand")
     world.live(0.3)
     move.obey()
     world.live(0.6)
     assert not grasp.goals and not move.running
-    assert world.agent.loop.resume(time.monotonic())
+    assert world.loop.resume(time.monotonic())
     world.live(2.0, until=lambda: grasp.running)
     assert grasp.running
 

@@ -39,19 +39,22 @@ def imported(folder: Path, spec: Any = SPEC, **changed: Any) -> BagDemonstration
     return BagDemonstrations(folder, **options, spec=spec)
 
 
+def episodes_of(demonstrations: BagDemonstrations) -> list[Episode]:
+    return [demonstrations.episode(number) for number in range(len(demonstrations))]
+
+
 def brightness(episode: Episode) -> list[int]:
     """Return the numbers of the steps that the images show."""
     return [int(seen.rgb["front"].mean()) // 3 for seen in episode.observations]
 
 
 def test_an_episode_is_what_was_done_for_an_instruction_by_the_policy_or_a_person(bag: Path) -> None:
-    demonstrations = imported(bag)
-    episodes = [demonstrations.episode(number) for number in range(len(demonstrations))]
+    episodes = episodes_of(imported(bag))
     words = ["put the red block on the pad"] * 3 + ["lift the blue block"]
     assert [episode.instruction for episode in episodes] == words
     assert [episode.draws["recorded"]["person"] for episode in episodes] == [False, True, False, False]
     assert {episode.outcome for episode in episodes} == {"unverified"}
-    np.testing.assert_allclose(episodes[0].actions[:18], bags.executed((1,))[:18], atol=2e-4)
+    np.testing.assert_allclose(episodes[0].actions[:18], bags.SESSION[1].actions[:18], atol=2e-4)
     state = episodes[0].observations[0].state
     assert state[14] == pytest.approx(0.08) and np.abs(state[:7] - bags.HOME).max() < 0.05
     assert [seen.instruction for seen in episodes[3].observations] == ["lift the blue block"] * 6
@@ -60,7 +63,7 @@ def test_an_episode_is_what_was_done_for_an_instruction_by_the_policy_or_a_perso
     assert numbers == list(range(numbers[0], numbers[-1] + 1))
     assert 32 <= numbers[0] <= 33 and 44 <= numbers[-1] <= 46  # of the 33 … 44 in which the person moved the arm
     first = numbers.index(33)
-    np.testing.assert_allclose(person.actions[first : first + 12], bags.executed((4,)), atol=2e-4)
+    np.testing.assert_allclose(person.actions[first : first + 12], bags.SESSION[4].actions, atol=2e-4)
     assert person.actions.dtype == np.float32 and (person.actions[first:, 6] == 0).all()
 
 
@@ -68,7 +71,7 @@ def test_an_arm_that_is_guided_by_hand_moves_as_measured(tmp_path: Path) -> None
     parts = (
         bags.Part("running", bags.moving(6, 0), instruction="lift it"),
         bags.Part("handed over", bags.moving(10, 1, gripper=0.0), person=True, commands=False),
-        bags.Part("holding", np.repeat(bags.RESTING, 3, 0)),
+        bags.Part("holding", bags.resting()),
     )
     episode = imported(bags.write(tmp_path / "bag", parts)).episode(1)
     first = brightness(episode).index(7)
@@ -79,12 +82,10 @@ def test_an_arm_that_is_guided_by_hand_moves_as_measured(tmp_path: Path) -> None
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3], ids=["mcap", "sqlite3"])
 def test_a_session_without_a_policy_is_all_of_a_person(tmp_path: Path, storage: StoragePlugin) -> None:
     parts = [
-        bags.Part("", np.concatenate([np.repeat(bags.RESTING, 3, 0), bags.moving(10, seed)]), instruction=words)
+        bags.Part("", np.concatenate([bags.resting(), bags.moving(10, seed)]), instruction=words)
         for seed, words in enumerate(["lift it", "lift it", "put it down", ""])
     ]
-    bag = bags.write(tmp_path / "bag", parts, storage, status=False, compressed=True)
-    demonstrations = imported(bag)
-    episodes = [demonstrations.episode(number) for number in range(len(demonstrations))]
+    episodes = episodes_of(imported(bags.write(tmp_path / "bag", parts, storage, status=False, compressed=True)))
     assert [episode.instruction for episode in episodes] == ["lift it", "put it down"]  # the second repeats the first
     assert brightness(episodes[1])[-1] >= 37
 
@@ -154,12 +155,12 @@ def test_steps_have_the_rate_of_the_task_whatever_that_of_the_cameras(fps: float
 def test_an_empty_instruction_ends_nothing_where_a_status_tells_what_goes_on(tmp_path: Path) -> None:
     parts = (
         bags.Part("running", bags.moving(8, 0), instruction="lift it"),
-        bags.Part("stopped", np.repeat(bags.RESTING, 3, 0), instruction=""),
+        bags.Part("stopped", bags.resting(), instruction=""),
         bags.Part("handed over", bags.moving(10, 1), person=True),
-        bags.Part("holding", np.repeat(bags.RESTING, 3, 0)),
+        bags.Part("holding", bags.resting()),
     )
-    demonstrations = imported(bags.write(tmp_path / "bag", parts))
-    assert [demonstrations.numbers(number)[0] for number in range(len(demonstrations))] == ["lift it"] * 2
+    episodes = episodes_of(imported(bags.write(tmp_path / "bag", parts)))
+    assert [episode.instruction for episode in episodes] == ["lift it"] * 2
 
 
 def test_joint_states_count_when_they_were_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -189,7 +190,7 @@ def test_a_segment_without_images_is_left_out(tmp_path: Path, caplog: pytest.Log
     parts = (
         bags.Part("running", bags.moving(8, 0), instruction="lift it"),
         bags.Part("running", bags.moving(8, 1), instruction="lower it", images=False),
-        bags.Part("stopped", np.repeat(bags.RESTING, 3, 0)),
+        bags.Part("stopped", bags.resting()),
     )
     folder = bags.write(tmp_path / "bag", parts)
     assert len(imported(folder)) == 1 and "left out, because it has no image of front, wrist" in caplog.text
@@ -213,8 +214,7 @@ def test_images_of_another_kind_are_refused(tmp_path: Path, monkeypatch: pytest.
 def test_the_bags_in_a_folder_are_imported_in_order(tmp_path: Path) -> None:
     for name, words in (("first", "lift it"), ("second", "put it down")):
         bags.write(tmp_path / name, [bags.Part("running", bags.moving(10, 0), instruction=words)])
-    demonstrations = imported(tmp_path)
-    assert [demonstrations.episode(number).instruction for number in (0, 1)] == ["lift it", "put it down"]
+    assert [episode.instruction for episode in episodes_of(imported(tmp_path))] == ["lift it", "put it down"]
 
 
 @pytest.mark.parametrize("name", ["bag.mcap", "metadata.yaml"])
@@ -235,9 +235,7 @@ def test_a_damaged_bag_is_imported_or_refused_in_a_sentence(tmp_path: Path, name
             changed[place] ^= 1 << generator.randrange(8)
         (whole / name).write_bytes(changed)
         try:
-            demonstrations = imported(whole)
-            for number in range(len(demonstrations)):
-                assert np.isfinite(demonstrations.episode(number).actions).all()
+            assert all(np.isfinite(episode.actions).all() for episode in episodes_of(imported(whole)))
         except ValueError as error:
             assert str(whole) in str(error) and "\n" not in str(error) and len(str(error)) < 1000
             refused += 1

@@ -141,7 +141,7 @@ def test_a_chain_ends_where_one_instruction_fails_and_its_outcome_is_about_that_
 def test_a_demonstration_has_one_instruction_and_begins_where_those_before_it_end(chain: Tabletop) -> None:
     expert, starts = Waypoint(chain.spec), []
     with chain.blind():
-        for seed in range(8):
+        for seed in (0, 3, 7):
             episode = rollout(chain, expert, seed)
             assert episode.success and episode.completed is None and episode.task in GOALS
             assert {seen.instruction for seen in episode.observations} == {episode.draws["language"]["instruction"]}
@@ -160,17 +160,17 @@ def in_a_row(*counts: int) -> Report:
     )
 
 
-def test_a_chain_is_also_asked_for_with_other_blocks() -> None:
+def test_a_chain_is_also_asked_for_with_other_blocks(chain: Tabletop) -> None:
     environment = make_tabletop("task/goal=chain", "task.goal.length=3", "task/randomize/naming=swapped")
-    plain = make_tabletop("task/goal=chain", "task.goal.length=3")
     for seed in (FIRST, SECOND):
-        with environment.blind(), plain.blind():
+        with environment.blind(), chain.blind():
             environment.reset(seed)
-            plain.reset(seed)
-        asked, before = environment.simulation.requests, plain.simulation.requests
+            chain.reset(seed)
+        asked, before = environment.simulation.requests, chain.simulation.requests
         assert [type(each.goal) for each in asked] == [type(each.goal) for each in before]
         assert all(one.referents.blocks != other.referents.blocks for one, other in zip(asked, before, strict=True))
         assert all(one.referents.pads == other.referents.pads for one, other in zip(asked, before, strict=True))
+    environment.close()
 
 
 def test_a_report_tells_how_many_were_completed_in_a_row(tmp_path: Path) -> None:
@@ -214,7 +214,7 @@ def test_disturbances_are_of_the_episode_not_of_an_instruction() -> None:
     environment = make_tabletop("task/goal=chain", "task.goal.length=3", "task/randomize/disturbance=wide")
     expert, happened = Waypoint(environment.spec), 0
     with environment.blind():
-        for seed in range(FIRST_SEED, FIRST_SEED + 4):
+        for seed in (FIRST_SEED, FIRST_SEED + 1):
             observation, began = environment.reset(seed), []
             while not environment.done:
                 known = environment.completed
@@ -222,7 +222,7 @@ def test_disturbances_are_of_the_episode_not_of_an_instruction() -> None:
                 began += [len(environment.events)] if environment.completed > known else []
             happened += len(environment.events)
             assert len(environment.events) <= 1 and began == sorted(began)  # none is forgotten
-    assert happened >= 2 and environment.completed == 3
+    assert happened == 2 and environment.completed == 3
     environment.close()
 
 
@@ -246,9 +246,8 @@ def test_a_simulator_that_plays_single_instructions_refuses_a_chain(chain: Table
 
 def test_a_chain_starts_anywhere_under_noise_and_without_images(chain: Tabletop) -> None:
     noisy = make_tabletop("task/goal=chain", "task/randomize/sensor=wide", "task.image_size=[32,32]")
-    first = [noisy.reset(seed).rgb["front"] for seed in range(4)]
-    again = [noisy.reset(seed).rgb["front"] for seed in (3, 2, 1, 0)]
-    assert all(np.array_equal(one, two) for one, two in zip(first, again[::-1], strict=True))
+    first, second, again = (noisy.reset(seed).rgb["front"] for seed in (0, 1, 0))
+    assert np.array_equal(first, again) and not np.array_equal(first, second)
     noisy.close()
     with chain.blind():
-        assert all(chain.reset(seed).rgb == {} for seed in range(4))
+        assert chain.reset(0).rgb == {}

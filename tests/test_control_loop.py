@@ -186,12 +186,11 @@ def test_a_late_answer_still_ends_where_and_when_it_should(world: World) -> None
     ("break_it", "reason"),
     [
         (lambda world: setattr(world, "cameras", ["front"]), "camera wrist is older"),
-        (lambda world: setattr(world, "cameras", []), "camera front is older"),
         (lambda world: setattr(world, "apart", 0.08), "images of front, wrist are more than 0.05 s apart"),
         (lambda world: setattr(world, "measures", False), "joint state is older"),
         (lambda world: setattr(world, "answer", lambda observation: None), "inference takes longer"),
     ],
-    ids=["one camera", "no camera", "cameras out of step", "no joint states", "no answer"],
+    ids=["one camera", "cameras out of step", "no joint states", "no answer"],
 )
 def test_late_inputs_brake_and_hold_the_arm(world: World, break_it: Callable[[World], None], reason: str) -> None:
     world.run(0.3)
@@ -330,7 +329,10 @@ def test_an_arm_in_the_hands_of_a_person_is_not_commanded_and_goes_on_from_where
 @pytest.mark.parametrize(
     ("move", "says"),
     [
-        (lambda world: setattr(world, "joints", JOINT_HIGH - 0.01), "outside .* move it inside first"),
+        (
+            lambda world: setattr(world, "joints", JOINT_HIGH - 0.01),
+            r"panda_joint1 is at 2\.887 rad, outside -2\.847 to 2\.847: move it inside first",
+        ),
         (lambda world: setattr(world, "measures", False), "joint state is older"),
         (lambda world: world.loop.on_joint_state(world.joints + 0.01, np.zeros(7), 0.08, world.now), "still moves"),
     ],
@@ -382,20 +384,19 @@ def test_the_tool_stays_in_the_workspace_whose_corners_are_any_two_opposite_ones
         move[:, axis], move[:, -1] = 0.01 * sign, 1
         world.answer = lambda observation, move=move: move
         world.begin()
-        world.run(2.0)
+        world.run(1.2)
         assert world.tool[axis] == pytest.approx(middle[axis] + 0.05 * sign, abs=0.002)
 
 
 @pytest.mark.parametrize("fast", [False, True])
-@pytest.mark.parametrize("motion", [(0, 0, -0.04), (0.04, 0, -0.04), (0, 0.04, -0.04), (0.04, 0.04, -0.04)], ids=str)
+@pytest.mark.parametrize("motion", [(0, 0, -0.04), (0.04, 0.04, -0.04)], ids=str)
 def test_the_tool_stays_in_the_workspace_where_joints_at_their_limits_bend_its_path(
     motion: tuple[float, ...], fast: bool
 ) -> None:
-    low, high = np.array([0.25, -0.4, 0.008]), np.array([0.75, 0.4, 0.5])
-    world = World(replace(SAFETY, workspace=(tuple(low), tuple(high))))
-    if fast:
-        faster = replace(ROBOT, acceleration=[100.0] * 7)
-        world.loop = ControlLoop(SPEC, faster, world.loop.safety, 50.0)
+    assert SAFETY.workspace is not None
+    low, high = map(np.array, SAFETY.workspace)
+    world = World()
+    world.loop = ControlLoop(SPEC, replace(ROBOT, acceleration=[100.0 if fast else 50.0] * 7), SAFETY, 50.0)
     random = np.random.default_rng(0)
     world.begin()
     turns: list[float] = []
@@ -469,7 +470,7 @@ def test_the_horizon_is_continuous_with_the_commands(actions: int, longest: floa
     world.answer = lambda observation: generator.uniform(SPEC.low, SPEC.high, (actions, 7))
     world.begin()
     sent: list[np.ndarray] = []
-    for command in world.ticks(2.0):
+    for command in world.ticks(1.0):
         planned = world.loop.motion.horizon(world.now, longest)
         ahead = [each.position for each in planned]
         assert not planned[-1].velocity.any()

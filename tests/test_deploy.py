@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -32,6 +33,7 @@ from warm import Started
 
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
+from vla.deploy import say
 from vla.deploy.loop import Loop
 from vla.deploy.messages import SimulatedEpisode
 from vla.deploy.operator import DemoOperator
@@ -205,6 +207,11 @@ def test_the_whole_loop_reports_and_its_bag_is_learned_from(home: Path, start: C
     learn_from_the_bag(home)
 
 
+def loop_of(output: Path, *overrides: str) -> Experiment:
+    agent = ("agent=remote", "agent.url=ws://127.0.0.1:1")
+    return Experiment.of(composed("job=deploy", "deploy=loop", *agent, f"output={output}", *overrides))
+
+
 def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def play() -> Result:
         if results:
@@ -214,10 +221,8 @@ def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monk
     results = [Result(5, "success")]
     operator = SimpleNamespace(play=play, stopped=threading.Event(), values={})
     monkeypatch.setattr(Loop, "running", lambda loop: nullcontext(operator))
-    agent = ("agent=remote", "agent.url=ws://127.0.0.1:1")
-    experiment = Experiment.of(composed("job=deploy", "deploy=loop", *agent, f"output={tmp_path}"))
     with pytest.raises(ValueError, match=r"ended with an error, see .*report.json: timed out after 60 s"):
-        job.run(experiment)
+        job.run(loop_of(tmp_path))
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["successes"], report["episodes"], report["errors"], report["seeds"]) == (1, 1, 1, [5, 6])
 
@@ -231,9 +236,8 @@ def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monk
     ],
 )
 def test_a_loop_that_would_report_something_else_is_refused(override: str, sentence: str, tmp_path: Path) -> None:
-    agent = ("agent=remote", "agent.url=ws://127.0.0.1:1")
     with pytest.raises(ValueError, match=sentence):
-        job.run(Experiment.of(composed("job=deploy", "deploy=loop", *agent, override, f"output={tmp_path}")))
+        job.run(loop_of(tmp_path, override))
 
 
 def test_a_loop_that_is_interrupted_before_an_episode_is_over_leaves_no_report(
@@ -242,8 +246,7 @@ def test_a_loop_that_is_interrupted_before_an_episode_is_over_leaves_no_report(
     (stopped := threading.Event()).set()
     operator = SimpleNamespace(stopped=stopped, values={})
     monkeypatch.setattr(Loop, "running", lambda loop: nullcontext(operator))
-    agent = ("agent=remote", "agent.url=ws://127.0.0.1:1")
-    job.run(Experiment.of(composed("job=deploy", "deploy=loop", *agent, f"output={tmp_path}")))
+    job.run(loop_of(tmp_path))
     assert not [*tmp_path.iterdir()]
 
 
@@ -287,18 +290,20 @@ def test_arguments_of_ros_are_split_off() -> None:
         ([CHECKPOINT, "deploy=ros2", "~deploy.topics.images.wrist"], "wrist"),
     ],
 )
-def test_invalid_deployments_end_in_one_sentence(home: Path, arguments: list[str], words: str) -> None:
-    node = "--ros-args" in arguments or words == "wrist"  # which has a log of its own
-    run = vla if node else here
+def test_invalid_deployments_end_in_one_sentence(
+    home: Path, arguments: list[str], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vla.deploy.ros.arguments", [])
+    run = vla if words == "wrist" else here
     done = run(home, "job=deploy", *arguments, ok=False)
-    # The node logs its own errors, too.
+    # The node, in a process of its own, logs its own errors, too.
     assert re.fullmatch(r"(\[ERROR\] .*\n)?error: .*\n", done.stderr) and words in done.stderr
 
 
-def test_a_too_long_instruction_is_not_sent(start: Callable[..., Started]) -> None:
-    said = start("vla.deploy.say", "push " * 201)
-    assert said.printed(30).startswith("error: the instruction has 1005 characters")
-    assert said.wait() == 1
+def test_a_too_long_instruction_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["say", "push " * 201])
+    with pytest.raises(SystemExit, match=r"^error: the instruction has 1005 characters"):
+        say.main()
 
 
 def test_an_interrupted_instruction_is_not_sent(start: Callable[..., Started], probe: Probe) -> None:
@@ -308,14 +313,10 @@ def test_an_interrupted_instruction_is_not_sent(start: Callable[..., Started], p
     assert said.wait(5) == -signal.SIGINT  # and not after the ten seconds in which it waits for an agent
 
 
-def test_without_ros_the_error_says_what_to_install(home: Path) -> None:
-    (home / "without").mkdir()
-    (home / "without/rclpy.py").write_text("raise ImportError('not here')")
-    paths = [str(home / "without"), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-    command = [sys.executable, "-m", "vla.run", "job=deploy", "deploy=ros2", CHECKPOINT]
-    done = subprocess.run(command, cwd=home, env=environment, capture_output=True, text=True)
-    assert done.returncode == 1 and "vla[ros]" in done.stderr and "Traceback" not in done.stderr
+def test_without_ros_the_error_says_what_to_install(home: Path, tmp_path: Path) -> None:
+    (tmp_path / "rclpy.py").write_text("raise ImportError('not here')")
+    done = vla(tmp_path, "job=deploy", "deploy=ros2", f"checkpoint={home / 'run'}", ok=False)
+    assert "vla[ros]" in done.stderr and "not here" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_a_policy_is_deployed_where_nothing_renders(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -344,14 +345,20 @@ def test_a_middleware_that_ignores_the_profile_is_refused(monkeypatch: pytest.Mo
     RosNetwork("loopback", None, None).apply()
 
 
-def test_a_ros_installation_finds_the_node() -> None:
+def test_a_ros_installation_finds_the_node(tmp_path: Path) -> None:
     prefix = Path(sysconfig.get_path("data"))
     assert (prefix / "share/ament_index/resource_index/packages/vla").is_file()
     package = ElementTree.parse(prefix / "share/vla/package.xml").getroot()
     assert package.findtext("name") == "vla" and package.find("maintainer") is not None
     compile((prefix / "share/vla/launch/agent.launch.py").read_text(), "agent.launch.py", "exec")
-    done = subprocess.run([prefix / "lib/vla/agent", "--help"], capture_output=True, text=True)
-    assert done.returncode == 0 and "deploy" in done.stdout
+    agent, python = tmp_path / "lib/vla/agent", tmp_path / "bin/python"  # an installation whose Python does nothing
+    for file in (agent, python):
+        file.parent.mkdir(parents=True)
+    shutil.copy(prefix / "lib/vla/agent", agent)
+    python.write_text('#!/bin/sh\necho "$@"')
+    python.chmod(0o700)
+    done = subprocess.run([agent, "checkpoint=my run"], capture_output=True, text=True, check=True)
+    assert done.stdout == "-m vla.run job=deploy deploy=ros2 checkpoint=my run\n"
 
 
 EPISODE = {

@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from exporting import content, exporter, stored
+from lerobot_files import EPISODES, INFO, ROWS, TASKS
 from rerun.chunk import RrdReader
 from toy import ARM_SPEC
 
@@ -24,10 +25,12 @@ from vla.data.formats.lerobot_images import decode, encode
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A `store` of 53 episodes, enough for two videos per camera, and the `dataset` made of it."""
+    """A `store` of seven episodes, and the `dataset` made of it, with two videos per camera."""
     home = tmp_path_factory.mktemp("home")
-    store, _ = stored(home / "store", seeds=range(66))
-    exporter("lerobot", home / "dataset").export(store)
+    store, _ = stored(home / "store", seeds=range(8))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vla.data.formats.lerobot_export.EPISODES_PER_VIDEO", 4)
+        exporter("lerobot", home / "dataset").export(store)
     return home
 
 
@@ -39,15 +42,12 @@ def test_a_video_leaves_the_priority_of_all_threads(tmp_path: Path) -> None:
 
 def test_every_row_is_that_of_the_store(home: Path) -> None:
     store = EpisodeStore(home / "store")
-    rows = pq.read_table(home / "dataset/data/chunk-000/file-000.parquet")
-    episodes = pq.read_table(home / "dataset/meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    tasks = dict(
-        zip(*(column.to_pylist() for column in pq.read_table(home / "dataset/meta/tasks.parquet").columns), strict=True)
-    )
-    info = json.loads((home / "dataset/meta/info.json").read_text())
+    rows, episodes = pq.read_table(home / "dataset" / ROWS), pq.read_table(home / "dataset" / EPISODES).to_pylist()
+    tasks = {row["task_index"]: row["task"] for row in pq.read_table(home / "dataset" / TASKS).to_pylist()}
+    info = json.loads((home / "dataset" / INFO).read_text())
     assert (info["codebase_version"], info["fps"]) == ("v3.0", 10)
-    assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (53, len(rows), 2)
-    assert len(store.episodes) == len(episodes) == 53
+    assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (7, len(rows), 2)
+    assert len(store.episodes) == len(episodes) == 7
     for number, (entry, episode) in enumerate(zip(store.episodes, episodes, strict=True)):
         expected, begin, end = store.read(entry), episode["dataset_from_index"], episode["dataset_to_index"]
         here = rows.slice(begin, end - begin).to_pydict()
@@ -63,10 +63,10 @@ def test_every_row_is_that_of_the_store(home: Path) -> None:
 
 def test_every_image_is_close_to_that_of_the_store(home: Path) -> None:
     store = EpisodeStore(home / "store")
-    episodes = pq.read_table(home / "dataset/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    episodes = pq.read_table(home / "dataset" / EPISODES).to_pylist()
     assert {episode["videos/observation.images.front/file_index"] for episode in episodes} == {0, 1}
-    for number in (0, 1, 49, 50, 52):
-        expected, episode = store.read(store.episodes[number]), episodes[number]
+    for entry, episode in zip(store.episodes, episodes, strict=True):
+        expected = store.read(entry)
         for camera in ARM_SPEC.cameras:
             video = f"videos/observation.images.{camera}"
             file = home / "dataset" / video / f"chunk-000/file-{episode[f'{video}/file_index']:03d}.mp4"
@@ -88,16 +88,15 @@ def test_statistics_are_those_of_all_rows_and_pixels(home: Path) -> None:
     np.testing.assert_allclose(found["q10"], np.quantile(action, 0.1, axis=0), atol=1e-12)
     np.testing.assert_allclose(np.reshape(image["q90"], 3), np.quantile(pixels, 0.9, axis=0), atol=1 / 255)
     assert found["count"] == image["count"] == [len(action)]
-    first = pq.read_table(home / "dataset/meta/episodes/chunk-000/file-000.parquet").to_pylist()[0]
+    first = pq.read_table(home / "dataset" / EPISODES).to_pylist()[0]
     np.testing.assert_allclose(first["stats/action/max"], store.read(store.episodes[0])["action"].max(0))
     assert np.shape(first["stats/observation.images.front/mean"]) == (3, 1, 1)
     assert first["stats/observation.images.front/count"] == [first["length"]]
 
 
-def test_rerun_opens_it(tmp_path: Path) -> None:
-    store, _ = stored(tmp_path / "store", seeds=range(2))
-    folder, recording = exporter("lerobot", tmp_path / "dataset").export(store), tmp_path / "dataset.rrd"
-    command = [sys.executable, "-m", "rerun", str(folder), "--bind", "127.0.0.1", "--save", str(recording)]
+def test_rerun_opens_it(home: Path, tmp_path: Path) -> None:
+    store, recording = EpisodeStore(home / "store"), tmp_path / "dataset.rrd"
+    command = [sys.executable, "-m", "rerun", home / "dataset", "--bind", "127.0.0.1", "--save", recording]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0 and "WARN" not in done.stdout + done.stderr, done.stdout + done.stderr
     reader = RrdReader(recording)
@@ -112,9 +111,9 @@ def test_rerun_opens_it(tmp_path: Path) -> None:
 
 def test_a_dataset_that_is_there_is_left_alone_and_another_one_is_refused(home: Path, tmp_path: Path) -> None:
     store, before = EpisodeStore(home / "store"), content(home / "dataset")
-    stamp = (home / "dataset/meta/info.json").stat().st_mtime_ns
+    stamp = (home / "dataset" / INFO).stat().st_mtime_ns
     exporter("lerobot", home / "dataset").export(store)
-    assert (home / "dataset/meta/info.json").stat().st_mtime_ns == stamp
+    assert (home / "dataset" / INFO).stat().st_mtime_ns == stamp
     with pytest.raises(ValueError, match=r"dataset has content other .*: choose another export\.folder"):
         exporter("lerobot", home / "dataset").export(EpisodeStore(home / "store", episodes=3))
     assert content(home / "dataset") == before

@@ -16,7 +16,6 @@ import pyarrow.parquet as pq
 import pytest
 from collecting import content
 from defaults import defaults_of
-from exporting import exporter, stored
 from lerobot_files import (
     EPISODES,
     FRONT,
@@ -85,23 +84,14 @@ def test_an_import_goes_on_where_it_was(home: Path, tmp_path: Path) -> None:
     assert content(tmp_path / "store") == content(home / "imported")
     with pytest.raises(ValueError, match=r"only 3 recorded episodes: set collect\.episodes=3"):
         imported(home / "dataset", tmp_path / "store", episodes=4)
-    other = exporter("lerobot", tmp_path / "other").export(stored(tmp_path / "another", seeds=range(4, 7))[0])
-    with pytest.raises(
-        ValueError, match=r"holds other episodes than these, such as 0: delete it .* another collect\.folder"
-    ):
-        imported(other, tmp_path / "store")
 
 
 def test_an_edited_dataset_is_not_taken_for_what_was_imported(home: Path, tmp_path: Path) -> None:
     store = Path(shutil.copytree(home / "imported", tmp_path / "store"))
-    edited = Path(shutil.copytree(home / "dataset", tmp_path / "edited"))
-    (edited / "meta/checksums.json").unlink()
-    imported(edited, store)  # it is the same without them
-    tasks = pq.read_table(edited / TASKS)
-    (name,) = [name for name in tasks.column_names if name != "task_index"]
-    words = pa.array([text.upper() for text in tasks[name].to_pylist()])
-    pq.write_table(tasks.set_column(tasks.column_names.index(name), name, words), edited / TASKS)
-    with pytest.raises(ValueError, match="holds other episodes than these, such as 0"):
+    edited = changed(home, tmp_path / "edited")
+    imported(edited, store)  # it is the same without checksums
+    column(TASKS, "task", lambda table: pa.array([text.upper() for text in table["task"].to_pylist()]))(edited)
+    with pytest.raises(ValueError, match=r"episodes than these, such as 0: delete it .* another collect\.folder"):
         imported(edited, store)
 
 
@@ -144,7 +134,6 @@ def more_columns(dataset: Path) -> None:
 EQUAL: dict[str, Change] = {
     "rows in other files": lambda dataset: (spread(dataset), column(EPISODES, "data/file_index", 7)(dataset)),
     "further columns of tasks": more_columns,
-    "stamps begin later": stamped(lambda times: times + 3.4, pa.float32()),
     "stamps of a clock": stamped(lambda times: times + 1.7e9, pa.float64()),
     "29.97 for 30 Hz": stamped(lambda times: times * 1.001),
     "a rounded rate of a video": info(lambda info: info["features"][FRONT]["info"].update({"video.fps": 9})),
@@ -177,10 +166,9 @@ def test_images_in_tables_are_those_of_the_steps_wherever_the_rows_are(home: Pat
         (lambda image: as_file(image, "JPEG", quality=95, subsampling=0), 3, "RGB"),
         (lambda image: as_file(image, "WEBP", lossless=True), 3, "RGB"),
         (lambda image: png(image.convert("RGBA")), 4, "RGB"),
-        (lambda image: png(image.convert("L")), 1, "L"),
         (lambda image: as_file(image.convert("L"), "JPEG", quality=95), 1, "L"),
     ],
-    ids=["jpeg", "webp", "rgba", "grey", "grey_jpeg"],
+    ids=["jpeg", "webp", "rgba", "grey"],
 )
 def test_images_in_tables_are_of_many_kinds(
     home: Path, tmp_path: Path, packed: Callable[[Image.Image], bytes], channels: int, mode: str

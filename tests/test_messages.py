@@ -48,10 +48,8 @@ def test_padded_rows_and_other_encodings_are_understood() -> None:
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
-        ({"encoding": "16UC1"}, "encoding is '16UC1'"),
         ({"data": b"abc"}, "3 by 2 pixels of rgb8 has 3 bytes in rows of 9"),
         ({"step": 8}, "18 bytes in rows of 8"),
-        ({"step": 10}, "18 bytes in rows of 10"),
         ({"encoding": "x" * 10**6}, "encoding is 'x{79}…', expected"),
         ({"height": 0, "data": b""}, "3 by 0 pixels"),
         ({"height": 2**31, "width": 2**31, "step": 2**33}, "18 bytes"),
@@ -91,10 +89,10 @@ def test_a_compressed_image_that_is_none_is_refused(damage: Any) -> None:
         messages.image_from(SimpleNamespace(format="png", data=damage(data.getvalue())))
 
 
-def test_fingers_may_come_in_messages_of_their_own() -> None:
+def test_fingers_may_come_in_messages_of_their_own_with_further_joints() -> None:
     states = messages.JointStates(ROBOT)
     arm = SimpleNamespace(name=["two", "one"], position=[2.0, 1.0], velocity=[])
-    fingers = SimpleNamespace(name=["left", "right"], position=[0.02, 0.01], velocity=[])
+    fingers = SimpleNamespace(name=["left", "right", "knuckle"], position=[0.02, 0.01, 0.5], velocity=[])
     with pytest.raises(ValueError, match=r"joint state lacks left, right, .* it has two, one"):
         states.read(arm, 0.0)
     assert states.read(fingers, 1.0) is None
@@ -130,13 +128,6 @@ def test_joints_are_found_by_name() -> None:
 def test_joint_states_that_do_not_fit_are_refused(changed: dict, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         messages.JointStates(ROBOT).read(joints(**changed), 0.0)
-
-
-def test_a_gripper_may_report_further_joints() -> None:
-    states = messages.JointStates(ROBOT)
-    assert states.read(joints(name=["left", "right", "knuckle"], position=[0.01, 0.02, 0.5], velocity=[]), 1.0) is None
-    arm = states.read(joints(name=["one", "two"], position=[0.0, 0.0], velocity=[]), 1.1)
-    assert arm is not None and arm[2] == pytest.approx(0.03)
 
 
 def test_a_command_is_read_by_name() -> None:

@@ -28,29 +28,21 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[int, 
     return folder, {seed: rollout(environment, agent, seed, recorder) for seed in (SUCCESS, FAILURE)}
 
 
-def columns(file: Path) -> dict[str, dict[str, list[Any]]]:
-    """Entity → column → values, static ones included."""
-    entities: dict[str, dict[str, list[Any]]] = {}
+def entities_of(recorded: tuple[Path, dict[int, Episode]], seed: int) -> tuple[Episode, dict[str, dict[str, Any]]]:
+    """An episode, and from its recording entity → column → values, static ones included."""
+    folder, episodes = recorded
+    entities: dict[str, dict[str, Any]] = {}
+    file = folder / f"{recording_name(seed, episodes[seed].outcome)}.rrd"
     for chunk in RrdReader(file).stream().to_chunks():
-        values = chunk.to_record_batch().to_pydict()
-        entities.setdefault(chunk.entity_path, {}).update(values)
-    return entities
+        entities.setdefault(chunk.entity_path, {}).update(chunk.to_record_batch().to_pydict())
+    return episodes[seed], entities
 
 
 def test_every_step_is_recorded(recorded: tuple[Path, dict[int, Episode]]) -> None:
-    folder, episodes = recorded
-    episode = episodes[SUCCESS]
+    episode, entities = entities_of(recorded, SUCCESS)
     steps = len(episode.observations)
-    entities = columns(folder / f"{recording_name(SUCCESS, 'success')}.rrd")
-    per_step = [
-        "state/rad",
-        "state/rad.s",
-        "state/m",
-        "tokens",
-        "action/m/executed",
-        "action/m/clean",
-        "action/1/executed",
-    ]
+    per_step = [f"state/{unit}" for unit in ("rad", "rad.s", "m")]
+    per_step += ["tokens", "action/m/executed", "action/m/clean", "action/1/executed"]
     per_step += [f"camera/{name}/{kind}" for name in ("front", "wrist") for kind in ("rgb", "depth")]
     for path in per_step:
         assert entities[f"/{path}"]["step"] == list(range(steps)), path
@@ -62,10 +54,10 @@ def test_every_step_is_recorded(recorded: tuple[Path, dict[int, Episode]]) -> No
 
 
 def test_bodies_are_recorded_where_they_move_and_shapes_once(recorded: tuple[Path, dict[int, Episode]]) -> None:
-    folder, episodes = recorded
-    steps = len(episodes[SUCCESS].observations)
-    entities = columns(folder / f"{recording_name(SUCCESS, 'success')}.rrd")
-    assert entities["/world/arm.point"]["step"] == list(range(steps + 1))  # and where the last action led to
+    episode, entities = entities_of(recorded, SUCCESS)
+    assert entities["/world/arm.point"]["step"] == list(
+        range(len(episode.observations) + 1)
+    )  # and where the last action led to
     assert entities["/world/table"]["step"] == [0]
     for solid in ("box", "cylinder", "sphere", "capsule", "mesh"):
         assert "step" not in entities[f"/world/arm.point/{solid}"], solid
@@ -74,20 +66,19 @@ def test_bodies_are_recorded_where_they_move_and_shapes_once(recorded: tuple[Pat
 
 
 def test_depth_is_lossless_and_in_millimetres(recorded: tuple[Path, dict[int, Episode]]) -> None:
-    folder, episodes = recorded
-    depth = columns(folder / f"{recording_name(SUCCESS, 'success')}.rrd")["/camera/front/depth"]
+    episode, entities = entities_of(recorded, SUCCESS)
+    depth = entities["/camera/front/depth"]
     image = np.frombuffer(bytes(depth["DepthImage:buffer"][2][0]), np.uint16).reshape(16, 16)
-    np.testing.assert_array_equal(image, episodes[SUCCESS].observations[2].depth["front"])
+    np.testing.assert_array_equal(image, episode.observations[2].depth["front"])
     assert depth["DepthImage:meter"] == [[1000.0]]
 
 
 def test_text_tells_what_was_asked_what_happened_and_what_was_drawn(recorded: tuple[Path, dict[int, Episode]]) -> None:
-    folder, episodes = recorded
-    entities = columns(folder / f"{recording_name(FAILURE, 'timeout')}.rrd")
+    episode, entities = entities_of(recorded, FAILURE)
     [[instruction]] = entities["/instruction"]["TextDocument:text"]
-    assert episodes[FAILURE].instruction in instruction
+    assert episode.instruction in instruction
     assert "timeout** after 40 steps, seed 1000003" in instruction
-    assert str(episodes[FAILURE].draws["colour"]) in entities["/draws"]["TextDocument:text"][0][0]
+    assert str(episode.draws["colour"]) in entities["/draws"]["TextDocument:text"][0][0]
     facts = entities["/__properties/episode"]
     assert (facts["outcome"], facts["seed"], facts["steps"]) == ([["timeout"]], [[FAILURE]], [[40]])
 

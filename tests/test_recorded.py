@@ -27,7 +27,7 @@ from vla.data.datamodule import held_out
 from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import action_bounds
-from vla.data.verification import find_episode
+from vla.data.verification import episode_of
 from vla.deploy.client_observation import Keys
 from vla.deploy.control_loop import ControlLoop
 from vla.io.images import resize
@@ -135,19 +135,14 @@ def renamed(dataset: Path, folder: Path, names: Any) -> Path:
         ({"left": ["waist", "elbow"], "right": ["waist"]}, ("left_waist", "left_elbow", "right_waist")),
         ({"b": 1, "a": 0, "c": 2}, ("a", "b", "c")),
         ({"left": [2], "right": [1]}, ("action_0", "action_1", "action_2")),
+        (None, ("action_0", "action_1", "action_2")),
     ],
 )
-def test_names_may_be_grouped_or_repeated(dataset: Path, tmp_path: Path, names: Any, expected: tuple[str, ...]) -> None:
+def test_names_may_be_grouped_repeated_or_none(
+    dataset: Path, tmp_path: Path, names: Any, expected: tuple[str, ...]
+) -> None:
     copy = renamed(dataset, tmp_path / "dataset", names)
     assert build(composed(copy)["task"], "task").spec.action == expected
-
-
-def test_unnamed_components_are_chosen_by_their_numbers(dataset: Path, tmp_path: Path) -> None:
-    copy = renamed(dataset, tmp_path / "dataset", None)
-    config = composed(copy, "task.action=[action_2,action_0,action_1]", "task.image_size=[12,12]")
-    spec = build(config["task"], "task").spec
-    found = build(config["expert"], "expert", spec=spec).episode(1)
-    np.testing.assert_array_equal(found.actions, episode(1).actions[:, [2, 0, 1]])
 
 
 def test_another_recording_is_not_taken_for_the_stored_one(dataset: Path, tmp_path: Path) -> None:
@@ -222,83 +217,78 @@ def test_an_expert_that_acts_has_no_recording(tmp_path: Path) -> None:
     )
 
 
+def small(dataset: Path) -> tuple[str, ...]:
+    """Arguments of the command line that choose the recording, in its own size."""
+    return ("task=recorded", f"expert.folder={dataset}", "task.image_size=[24,32]")
+
+
 def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset: Path, tmp_path: Path) -> None:
-    recording = ("task=recorded", f"expert.folder={dataset}", "task.image_size=[24,32]")
+    here(tmp_path, *small(dataset), "job=collect", "collect.folder=further", "output=collect")
+    recording, checkpoint = (*small(dataset), "collect.more=[further]"), tmp_path / "run"
     done = here(tmp_path, *recording, *TRAINING, *TINY, "hydra.run.dir=run", "output=run")
     errors = json.loads((tmp_path / "run/errors.json").read_text())
+    assert errors["seeds"] == [seed for seed in range(EPISODES) if held_out(seed, 0.2)]  # of the recording alone
     assert [each["name"] for each in errors["components"]] == list(NAMES) and "success" not in errors
     assert all(each["ci_low"] <= each["error"] <= each["ci_high"] for each in errors["components"])
     assert "not a success rate" in done.stdout and "success" not in done.stdout.replace("not a success rate", "")
     page = (tmp_path / "run/report.html").read_text()
     assert "Mean absolute errors on 2 held-out episodes" in page and "joint2.pos" in page and "success:" not in page
     assert "${" not in page and str(dataset) in page
-    checkpoint = tmp_path / "run"
+    assert list(read_policy(checkpoint).spec.action) == list(NAMES)
     again = ("job=evaluate", f"checkpoint={checkpoint}", "hydra.run.dir=again", "output=again")
     here(tmp_path, *again, *recording)
     repeated = json.loads((tmp_path / "again/errors.json").read_text())
     assert repeated["seeds"] == errors["seeds"] and repeated["components"] == errors["components"]
+    assert "learner.lr" not in compared([tmp_path / "run", tmp_path / "again"], tmp_path).read_text()
     forgot = here(tmp_path, *again, "task=recorded", f"expert.folder={dataset}", ok=False)
     assert "has image_size = (24, 32), but the task, with the options given here, has (96, 128)" in forgot.stderr
-    (kept,) = tmp_path.glob("outputs/episodes/*")  # both found it, and the last one imported nothing
-    shutil.copytree(kept, tmp_path / "further")
-    here(tmp_path, *recording, *TRAINING, *TINY, "collect.more=[further]", "hydra.run.dir=more", "output=more")
-    assert json.loads((tmp_path / "more/errors.json").read_text())["seeds"] == errors["seeds"]
+    (kept,) = tmp_path.glob("outputs/episodes/*")  # both found it
     shutil.rmtree(kept)
     assert "name its folder with expert=lerobot expert.folder=DIR" in here(tmp_path, *again, ok=False).stderr
-    fewer = here(tmp_path, *again, *recording, "collect.episodes=6", ok=False)
+    fewer = here(tmp_path, *again, *small(dataset), "collect.episodes=6", ok=False)
     assert "was trained on other episodes than the 6" in fewer.stderr
-    assert "learner.lr" not in compared([tmp_path / "run", tmp_path / "again"], tmp_path).read_text()
-    assert list(read_policy(checkpoint).spec.action) == list(NAMES)
 
 
 def test_a_training_on_all_episodes_ends_with_success_and_is_complete(dataset: Path, tmp_path: Path) -> None:
-    recording = ("task=recorded", f"expert.folder={dataset}", "task.image_size=[24,32]", "data.validation_fraction=0")
-    options = [option for option in TRAINING if not option.startswith("data.validation_fraction")]
+    recording = (*small(dataset), "data.validation_fraction=0")
     run = ("hydra.run.dir=outputs/runs/all", "output=outputs/runs/all")
-    done = here(tmp_path, *recording, *options, *TINY, *run)
+    done = here(tmp_path, *TRAINING, *recording, *TINY, *run)
     said = "data.validation_fraction=0 trains on all episodes and leaves none to evaluate the policy on"
     assert 0 <= done.stdout.find(said) < done.stdout.find("importing") < done.stdout.find("trained 4 steps")
     checkpoint = tmp_path / "outputs/runs/all/policy"
     assert checkpoint.is_dir() and not (tmp_path / "outputs/runs/all/errors.json").exists()
-    kept = [*tmp_path.glob("outputs/episodes/*")]
-    shutil.rmtree(kept[0])
+    (kept,) = tmp_path.glob("outputs/episodes/*")
+    shutil.rmtree(kept)
     for whose in ((f"checkpoint={checkpoint}",), ("agent=remote", "agent.url=ws://127.0.0.1:1")):
         refused = here(tmp_path, *recording, *whose, "output=again", ok=False)
         assert "data.validation_fraction=0: " in refused.stderr and "train with a larger fraction" in refused.stderr
-        assert not kept[0].exists() and not (tmp_path / "again").exists()
+        assert not kept.exists() and not (tmp_path / "again").exists()
 
 
 def test_a_served_policy_is_compared_with_the_episodes_that_a_training_holds_out(dataset: Path, tmp_path: Path) -> None:
-    recording = ("task=recorded", f"expert.folder={dataset}", "task.image_size=[24,32]")
     spec = build(composed(dataset, "task.image_size=[24,32]")["task"], "task").spec
     policy = as_policy(make_bc(spec=spec), spec=spec)
     cameras = {camera: f"observation.images.{camera}" for camera in spec.cameras}
     images = [f"+agent.images.{camera}={key}" for camera, key in cameras.items()]
     with serving(policy, keys=Keys(cameras, ["observation/state"], "prompt")) as url:
         asked = ("agent=remote", f"agent.url={url}", *images, "output=theirs")
-        said = here(tmp_path, *recording, *asked).stdout
+        said = here(tmp_path, *small(dataset), *asked).stdout
         assert "remote" in (tmp_path / "theirs/report.html").read_text() and "not a success rate" in said
         errors = json.loads((tmp_path / "theirs/errors.json").read_text())
         assert errors["checkpoint"] is None and errors["model"] == "remote"
-    folder = next(tmp_path.glob("outputs/episodes/*"))
-    unseen = [entry.seed for entry in EpisodeStore(folder).episodes if held_out(entry.seed, 0.2)]
-    expected = open_loop(
-        as_policy(policy.model, spec=spec), spec, [episode_at(folder, seed) for seed in unseen], np.zeros(3)
-    )
-    assert errors["seeds"] == unseen
+    store = EpisodeStore(next(tmp_path.glob("outputs/episodes/*")))
+    unseen = [entry for entry in store.episodes if held_out(entry.seed, 0.2)]
+    shown = [episode_of(store, entry) for entry in unseen]
+    expected = open_loop(as_policy(policy.model, spec=spec), spec, shown, np.zeros(3))
+    assert errors["seeds"] == [entry.seed for entry in unseen]
     np.testing.assert_allclose([each["error"] for each in errors["components"]], expected.errors.mean(0), rtol=1e-6)
-    assert (
-        "agent._target_ must name a class of kind Agent" in here(tmp_path, *recording, "agent=expert", ok=False).stderr
-    )
-
-
-def episode_at(folder: Path, seed: int) -> Episode:
-    return find_episode(EpisodeStore(folder), seed)[1]
+    with pytest.raises(ValueError, match=r"agent\._target_ must name a class of kind Agent"):
+        composing.check(composing.composed(*small(dataset), "agent=expert"))
 
 
 def test_imported_episodes_are_exported_as_others_are(dataset: Path, tmp_path: Path) -> None:
-    recording = ("task=recorded", f"expert.folder={dataset}", "task.image_size=[24,32]", "collect.folder=store")
-    here(tmp_path, "job=export", "export=lerobot", *recording, "export.folder=new", "output=run", "cluster.workers=1")
+    folders = ("collect.folder=store", "export.folder=new", "output=run")
+    here(tmp_path, "job=export", "export=lerobot", *small(dataset), *folders, "cluster.workers=1")
     again = build(composed(tmp_path / "new", "task.image_size=[24,32]")["task"], "task").spec
     assert (again.action, again.state, again.control_hz) == (NAMES, NAMES, 30.0)
 

@@ -10,8 +10,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, closing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import replace
 from functools import partial
 from itertools import cycle, takewhile
@@ -24,7 +25,7 @@ import msgpack
 import numpy as np
 import pytest
 from command_line import SMALL, here
-from composing import composed
+from composing import check, composed
 from defaults import defaults_of
 from fake_batch import as_policy, make_act, make_bc, make_denoising, make_rt1
 from toy import SPEC, ToyEnvironment
@@ -72,6 +73,12 @@ def received(connection: ClientConnection) -> Any:
     return unpack(data)
 
 
+def ask(connection: ClientConnection, content: Any) -> Any:
+    """The answer to a message."""
+    connection.send(pack(content))
+    return received(connection)
+
+
 def message(observation: Observation) -> dict[str, Any]:
     return {
         "observation/image": observation.rgb["eye"],
@@ -90,6 +97,13 @@ def remote(url: str, **changes: Any) -> RemotePolicy:
     return RemotePolicy(**defaults_of("agent/remote", url=url, **{**own, "spec": SPEC, **changes}))
 
 
+@contextmanager
+def acting(policy: Policy, **changes: Any) -> Iterator[RemotePolicy]:
+    """A client, made with some changes, of a server with the policy."""
+    with serving(policy) as url, closing(remote(url, **changes)) as agent:
+        yield agent
+
+
 def before_plans(policy: Policy, monkeypatch: pytest.MonkeyPatch, do: Callable[[int], object]) -> None:
     """Let the policy do something before it plans, given the number of observations so far."""
     plan, asked = policy.plan, list[Observation]()
@@ -102,19 +116,17 @@ def before_plans(policy: Policy, monkeypatch: pytest.MonkeyPatch, do: Callable[[
     monkeypatch.setattr(policy, "plan", planned)
 
 
-@pytest.mark.parametrize("make", [make_bc, make_rt1], ids=["one frame", "a history"])
-def test_a_client_gets_the_chunks_of_the_policy_bit_for_bit(make: Callable[[], Any]) -> None:
-    policy = as_policy(make())
-    seen = observations(4)
-    expected = as_policy(policy.model)
+def test_a_client_gets_the_chunks_of_the_policy_and_anew_after_a_reset() -> None:
+    policy, seen = as_policy(make_rt1()), observations(4)
+    expected, anew = as_policy(policy.model), as_policy(policy.model).plan(seen[3])
     with serving(policy) as url, client(url) as connection:
-        described, answers = received(connection), []
+        described = received(connection)
         for observation in seen:
-            connection.send(pack(message(observation)))
-            answers.append(received(connection))
-            np.testing.assert_array_equal(answers[-1]["actions"], expected.plan(observation))
-    assert answers[-1]["actions"].dtype == np.float32
-    assert answers[-1]["server_timing"].keys() == {"infer_ms"}
+            answer = ask(connection, message(observation))
+            np.testing.assert_array_equal(answer["actions"], expected.plan(observation))
+            assert answer["actions"].dtype == np.float32 and answer["server_timing"].keys() == {"infer_ms"}
+        assert ask(connection, {"reset": True, "seed": 3, "prompt": "do what is to be done"}) == {"reset": True}
+        np.testing.assert_array_equal(ask(connection, message(seen[3]))["actions"], anew)
     assert described["images"] == {"observation/image": [16, 16, 3]} and described["prompt"] == "prompt"
     assert described["action"]["names"] == list(SPEC.action) and described["history"] == policy.model.history
     np.testing.assert_array_equal(described["action"]["high"], np.array(SPEC.high, np.float32))
@@ -122,9 +134,8 @@ def test_a_client_gets_the_chunks_of_the_policy_bit_for_bit(make: Callable[[], A
 
 def test_a_slow_server_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     policy, gate, seen = as_policy(make_bc(chunk=3)), threading.Event(), observations(60)
-    with serving(policy) as url:
+    with acting(policy, asynchronous=True, execute=1, spec=replace(SPEC, control_hz=200.0)) as agent:
         before_plans(policy, monkeypatch, lambda number: number == 1 or gate.wait(30))
-        agent = remote(url, asynchronous=True, execute=1, spec=replace(SPEC, control_hz=200.0))
         agent.reset(seen[0].instruction, 0)
         first = as_policy(policy.model).plan(seen[0])
         actions = [agent.act(observation) for observation in seen[:5]]
@@ -139,40 +150,33 @@ def test_a_slow_server_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> Non
         np.testing.assert_array_equal(later, as_policy(policy.model).plan(seen[1])[2])
         agent.reset(seen[0].instruction, 0)  # whatever is awaited is dropped
         np.testing.assert_array_equal(agent.act(seen[0]), first[0])
-        agent.close()
 
 
 @pytest.mark.parametrize("make", [make_bc, make_rt1, make_act, partial(make_denoising, Flow)])
-@pytest.mark.parametrize("rows", [1, 2, 4])
+@pytest.mark.parametrize("rows", [1, 3])
 def test_clients_act_as_if_they_were_alone_bit_for_bit(make: Callable[[], Model], rows: int) -> None:
     policy = as_policy(make(), lanes=rows)
     streams = [[replace(each, instruction=text) for each in observations(3, seed)] for seed, text in enumerate(TEXTS)]
-    results: dict[int, list[Array]] = {}
 
-    def talk(seed: int) -> None:
+    def talk(seed: int) -> list[Array]:
         with client(url) as connection:
             connection.recv()
-            for content in ({"reset": True, "seed": seed, "prompt": TEXTS[seed]}, *map(message, streams[seed])):
-                connection.send(pack(content))
-                results.setdefault(seed, []).append(received(connection).get("actions"))
+            ask(connection, {"reset": True, "seed": seed, "prompt": TEXTS[seed]})
+            return [ask(connection, message(each))["actions"] for each in streams[seed]]
 
-    with serving(policy) as url:
-        threads = [threading.Thread(target=talk, args=[seed]) for seed in range(len(TEXTS))]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(20)
+    with serving(policy) as url, ThreadPoolExecutor(len(TEXTS)) as threads:
+        results = [*threads.map(talk, range(len(TEXTS)))]
     for seed, stream in enumerate(streams):
         alone = as_policy(policy.model, lanes=rows)
         alone.reset(TEXTS[seed], seed)
-        np.testing.assert_array_equal(results[seed][1:], [alone.plan(each) for each in stream])
+        np.testing.assert_array_equal(results[seed], [alone.plan(each) for each in stream])
 
 
 def test_a_plan_goes_on_from_the_one_that_a_client_executes() -> None:
     model = make_denoising(Flow, chunk=8, execute=2, prefix=4)
     policy, seen = as_policy(model, chunking=TrainedPrefix()), observations(5)
     expected, plans = as_policy(model, chunking=TrainedPrefix()), list[Array]()
-    with serving(policy) as url, closing(remote(url)) as agent:
+    with acting(policy) as agent:
         assert agent.metadata["chunking"] is True and agent.execute == 2  # before the first plan
         agent.reset(seen[0].instruction, 0)
         acted = [agent.act(observation) for observation in seen]
@@ -183,9 +187,9 @@ def test_a_plan_goes_on_from_the_one_that_a_client_executes() -> None:
         late = replace(seen[0], running=Running(plans[2][1:], 3))
         np.testing.assert_array_equal(agent.plan(late)[:3], plans[2][1:4])
         mapped = {name: Component(index, 1.0, 0.0) for index, name in enumerate(SPEC.action)}
-        with closing(remote(url, actions=mapped)) as other:
+        with closing(remote(agent.url, actions=mapped)) as other:
             assert "running" not in other.message(late)
-    with serving(as_policy(make_bc())) as url, closing(remote(url)) as agent:
+    with acting(as_policy(make_bc())) as agent:
         assert agent.metadata["chunking"] is False and "running" not in agent.message(late)
 
 
@@ -203,21 +207,6 @@ def test_a_plan_goes_on_from_the_one_that_a_client_executes() -> None:
 def test_a_plan_that_is_none_is_refused(running: Any, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         KEYS.observation({**message(observations(1)[0]), "running": running}, SPEC)
-
-
-def test_a_reset_begins_another_episode() -> None:
-    policy = as_policy(make_rt1())
-    seen = observations(3)
-    expected = as_policy(policy.model).plan(seen[2])
-    with serving(policy) as url, client(url) as connection:
-        connection.recv()
-        for observation in seen[:2]:
-            connection.send(pack(message(observation)))
-            connection.recv()
-        connection.send(pack({"reset": True, "seed": 3, "prompt": "do what is to be done"}))
-        assert received(connection) == {"reset": True}
-        connection.send(pack(message(seen[2])))
-        np.testing.assert_array_equal(received(connection)["actions"], expected)
 
 
 def test_images_of_other_sizes_kinds_and_places_are_taken() -> None:
@@ -249,15 +238,18 @@ def test_the_encoding_is_documented() -> None:
     assert given["seed"] == 5 and given["image"].tolist() == [[[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11]]]
 
 
-@pytest.mark.parametrize("library", ["msgpack", "websockets"])
-@pytest.mark.parametrize("target", ["vla.deploy.server.PolicyServer", "vla.rollouts.remote.RemotePolicy"])
+@pytest.mark.parametrize(
+    ("library", "target"),
+    [("msgpack", "vla.deploy.server.PolicyServer"), ("websockets", "vla.rollouts.remote.RemotePolicy")],
+)
 def test_what_is_missing_is_said_with_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch, library: str, target: str
 ) -> None:
-    for module in ("vla.io.array_messages", target.rpartition(".")[0]):
-        monkeypatch.delitem(sys.modules, module)
+    for module in [*sys.modules]:
+        if module in ("vla.io.array_messages", target.rpartition(".")[0]) or module.startswith(f"{library}."):
+            monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(MissingLibrary, match=rf"pip install -e '\.\[server\]' \(.*{library}"):
+    with pytest.raises(MissingLibrary, match=rf"{library}.* its extra server: pip install -e '\.\[server\]'"):
         locate("here", target)
 
 
@@ -269,10 +261,8 @@ def test_scalars_of_numpy_are_numbers() -> None:
     seen = {**message(observations(1)[0]), "observation/state": [np.float32(0.5), np.int8(1)]}
     with serving(policy) as url, client(url) as connection:
         connection.recv()
-        connection.send(pack({"reset": np.bool_(True), "prompt": "go", "seed": np.int64(5)}))
-        assert received(connection) == {"reset": True}
-        connection.send(pack(seen))
-        assert received(connection)["actions"].dtype == np.float32
+        assert ask(connection, {"reset": np.bool_(True), "prompt": "go", "seed": np.int64(5)}) == {"reset": True}
+        assert ask(connection, seen)["actions"].dtype == np.float32
 
 
 WHOLE = message(observations(1)[0])
@@ -330,8 +320,7 @@ def test_who_sends_nonsense_is_told_why_and_disturbs_nobody() -> None:
             large.send(pack({"observation/image": np.zeros(2_000_000, np.uint8)}))
             with pytest.raises(ConnectionClosed, match="1009"):
                 large.recv()
-        good.send(pack(WHOLE))
-        np.testing.assert_array_equal(received(good)["actions"], expected)
+        np.testing.assert_array_equal(ask(good, WHOLE)["actions"], expected)
 
 
 def test_only_so_many_come_in_and_only_with_the_key() -> None:
@@ -383,8 +372,7 @@ def test_what_cannot_be_served_is_said_in_a_sentence() -> None:
             settings(policy, port=port).run()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_it_serves_until_it_is_told_to_stop(number: signal.Signals, caplog: pytest.LogCaptureFixture) -> None:
+def test_it_serves_until_it_is_told_to_stop(caplog: pytest.LogCaptureFixture) -> None:
     asked = []
 
     def stop() -> None:
@@ -393,7 +381,7 @@ def test_it_serves_until_it_is_told_to_stop(number: signal.Signals, caplog: pyte
             time.sleep(0.01)
         url = caplog.messages[0].removeprefix("serving the policy at ").replace("ws://", "http://")
         asked.append(urlopen(f"{url}/healthz").read())
-        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGINT)
 
     with caplog.at_level(logging.INFO, "vla.deploy.server"):
         thread = threading.Thread(target=stop, daemon=True)
@@ -423,13 +411,11 @@ def test_somebody_elses_actions_become_ours() -> None:
 def test_images_are_sent_first_by_channel_and_in_maps_within_maps() -> None:
     policy, observation = as_policy(make_bc()), observations(1)[0]
     expected = as_policy(policy.model).plan(observation)
-    with serving(policy) as url:
-        agent = remote(url, images={"eye": ["observation", "image"]}, channels_first=True)
+    with acting(policy, images={"eye": ["observation", "image"]}, channels_first=True) as agent:
         sent = agent.message(observation)
         np.testing.assert_array_equal(sent["observation"]["image"], observation.rgb["eye"].transpose(2, 0, 1))
         agent.reset(observation.instruction, 0)
         np.testing.assert_array_equal(agent.plan(observation), expected)
-        agent.close()
 
 
 def test_a_server_with_other_components_or_another_rate_is_noticed(caplog: pytest.LogCaptureFixture) -> None:
@@ -458,12 +444,11 @@ def test_a_server_with_other_components_or_another_rate_is_noticed(caplog: pytes
 
 def test_a_late_answer_is_not_taken_for_that_of_the_next_observation(monkeypatch: pytest.MonkeyPatch) -> None:
     policy, gate, seen = as_policy(make_bc()), threading.Event(), observations(4)
-    with serving(policy) as url:
+    with acting(policy) as agent:
         before_plans(policy, monkeypatch, lambda number: number != 2 or gate.wait(30))
-        agent = remote(url)
         agent.act(seen[0])
-        agent._connection.timeout = 0.5
-        with pytest.raises(ValueError, match=r"no answer within 0\.5 s"):
+        agent._connection.timeout = 0.1
+        with pytest.raises(ValueError, match=r"no answer within 0\.1 s"):
             agent.act(seen[1])
         gate.set()
         agent._connection.timeout = 30.0
@@ -471,7 +456,6 @@ def test_a_late_answer_is_not_taken_for_that_of_the_next_observation(monkeypatch
             agent.act(seen[2])  # within the same episode it stays that way
         agent.reset(seen[3].instruction, 1)
         np.testing.assert_array_equal(agent.act(seen[3]), as_policy(policy.model).plan(seen[3])[0])
-        agent.close()
 
 
 def test_a_server_that_fails_or_goes_away_costs_an_episode_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -522,7 +506,6 @@ def test_an_address_is_reached_directly_whatever_proxy_the_environment_names(mon
     ("url", "why"),
     [
         ("ws://127.0.0.1:99999", "Port out of range 0-65535"),
-        ("ws://[::1", "Invalid IPv6 URL"),
         ("127.0.0.1:8000", "scheme isn't ws or wss"),
     ],
 )
@@ -576,5 +559,5 @@ def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:
     report = json.loads((tmp_path / "expert/report.json").read_text())
     assert (report["model"], report["successes"]) == ("expert", 1)
     assert "<h1>expert · pick place</h1>" in (tmp_path / "expert/report.html").read_text()
-    refused = here(tmp_path, "agent=expert", "job=train", ok=False).stderr
-    assert refused == "error: job=train takes no agent: agent=OPTION goes with job=evaluate and deploy\n"
+    with pytest.raises(ValueError, match=r"^job=train takes no agent: agent=OPTION goes with job=evaluate"):
+        check(composed("agent=expert", "job=train"))

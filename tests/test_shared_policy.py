@@ -36,8 +36,8 @@ def test_reports_are_the_same_with_any_number_of_workers() -> None:
     policy = as_policy(make_bc(chunk=2), lanes=2)
     beside = evaluate(Telling, lambda world: policy, None, SEEDS)
     with shared_policy(lambda: policy) as agent:
-        reports = [evaluate(Telling, agent, None, SEEDS, Cluster(workers, "beside")) for workers in (1, 2, 4)]
-    assert not beside.errors and reports == [beside] * 3
+        reports = [evaluate(Telling, agent, None, SEEDS, Cluster(workers, "beside")) for workers in (1, 3)]
+    assert not beside.errors and reports == [beside] * 2
 
 
 @pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
@@ -78,7 +78,7 @@ def test_what_does_not_fit_is_said_and_no_memory_is_left_behind(monkeypatch: pyt
         with pytest.raises(ValueError, match=r"the policy has cameras = \('eye',\), but the task has"):
             make_agent(ToyEnvironment(spec=SPEC.from_dict({**SPEC.to_dict(), "cameras": ["ear"]})))
         with closing(make_agent(ToyEnvironment())) as agent:
-            (seen,) = (SPEC.random_observation(np.random.default_rng(0)),)
+            seen = SPEC.random_observation(np.random.default_rng(0))
             with pytest.raises(ValueError, match=r"the world gives eye of \(16, 16, 3\) uint8, not \(8, 16, 3\) uint8"):
                 agent.act(Observation({"eye": seen.rgb["eye"][:8]}, seen.state, "go"))
             with pytest.raises(ValueError, match=r"the policy needs cameras"):

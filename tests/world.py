@@ -23,9 +23,11 @@ from rclpy.executors import SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image, JointState
 from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from vla.deploy import messages
+from vla.deploy.control_loop import ControlLoop
 from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.policy_node import PolicyNode
 from vla.deploy.ros import RosNetwork
@@ -167,6 +169,17 @@ class World:
         self.spin(answer.done)
         return answer.result()
 
+    def trigger(self, name: str) -> Any:
+        """Call a service of the agent that is asked for nothing else."""
+        return self.ask(Trigger, name, Trigger.Request())
+
+    def hand_over(self, to_person: bool) -> Any:
+        """Ask the agent to leave the arm to a person, or to take it back."""
+        return self.ask(SetBool, "hand_over", SetBool.Request(data=to_person))
+
+    def say(self, instruction: str) -> None:
+        self.words.publish(String(data=instruction))
+
     def change(self, transition: int) -> bool:
         request = ChangeState.Request(transition=Transition(id=transition))
         return bool(self.ask(ChangeState, "change_state", request).success)
@@ -177,7 +190,7 @@ class World:
         publishers = [*self.images.values(), self.states, self.words]
         self.spin(lambda: all(publisher.get_subscription_count() for publisher in publishers))
         self.live(2.0, until=commanded or (lambda: self.commands))
-        self.words.publish(String(data="put the red block on the pad"))
+        self.say("put the red block on the pad")
         self.live(2.0, until=lambda: self.policy.seen[-1].instruction)
         self.live(0.1)
 
@@ -187,9 +200,18 @@ class World:
         return self.state is state
 
     @property
-    def state(self) -> State:
+    def loop(self) -> ControlLoop:
         assert self.agent.loop is not None
-        return self.agent.loop.state
+        return self.agent.loop
+
+    @property
+    def state(self) -> State:
+        return self.loop.state
+
+    @property
+    def told(self) -> dict[str, str]:
+        """The values of the newest status."""
+        return {pair.key: pair.value for pair in self.statuses[-1].values}
 
     def close(self) -> None:
         for executor, node in zip(self.executors, (self.agent, self.node), strict=True):

@@ -13,6 +13,7 @@ import types
 from collections.abc import Collection, Iterable, Mapping, MutableMapping, Sequence
 from functools import cache
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, requires
 from math import isfinite
 from pathlib import Path
 from socket import gethostname
@@ -63,13 +64,24 @@ def locate(key: str, target: Any) -> type:
     except (ImportError, AttributeError) as error:
         where = "" if target.startswith(OWN) else f" on {gethostname()}, where {package} must be installed"
         library = isinstance(error, ModuleNotFoundError) and not f"{error.name}.".startswith(f"{package}.")
-        kind = MissingLibrary if library else UserError
-        raise kind(f"{key} is {target}, which cannot be imported{where}: {error}") from error
+        kind, hint = (MissingLibrary, _how_to_install(str(error.name))) if library else (UserError, "")
+        raise kind(f"{key} is {target}, which cannot be imported{where}: {error}{hint}") from error
     # A module's attributes include its imports, such as `os`.
     defined = isinstance(found, type) and found.__module__.partition(".")[0] in (OWN.rstrip("."), package)
     if not isinstance(found, type) or not (target in LIBRARY or defined):
         raise UserError(f"{key} must name a class that is defined in {package}, got {target!r}")
     return found
+
+
+def _how_to_install(module: str) -> str:
+    """Return how to install the extra of this package that a module belongs to, if it belongs to one."""
+    try:
+        requirements = requires("vla") or []
+    except PackageNotFoundError:  # it runs from its folder
+        return ""
+    pattern = rf"{re.escape(module.partition('.')[0])}\b.*extra == '(?!dev')(\w+)'"
+    extras = [found[1] for each in requirements if (found := re.match(pattern, each))]
+    return f"; install this package with its extra {extras[0]}: pip install -e '.[{extras[0]}]'" if extras else ""
 
 
 def require_trusted(source: object, target: Any, imported: bool = False) -> None:

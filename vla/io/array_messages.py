@@ -10,16 +10,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import msgpack
 import numpy as np
 
 from vla.io.errors import UserError
-
-try:
-    import msgpack
-    import websockets  # noqa: F401 who encodes messages sends them
-except ModuleNotFoundError as error:
-    hint = f"install this package with its extra server, as in pip install -e '.[server]' ({error})"
-    raise ModuleNotFoundError(hint, name=error.name) from error
 
 LONGEST_LIST = 10_000  # items of a list, or of all lists in a message
 LONGEST_TEXT = 100_000  # characters of a string
