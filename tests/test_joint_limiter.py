@@ -11,6 +11,7 @@ from composing import CONF
 from defaults import defaults_of
 
 from vla.deploy.joint_limiter import JointLimiter, JointLimits
+from vla.deploy.motion import LEEWAY, _Workspace
 
 PERIOD = 0.02
 TWO = {"joints": ["a", "b"], "low": [-1.0, -2.0], "high": [1.0, 2.0], "speed": [2.0, 1.0], "acceleration": [10.0, 5.0]}
@@ -91,3 +92,20 @@ def test_every_robot_has_limits_of_every_joint(robot: str) -> None:
     assert (arm.min_position < arm.max_position).all() and len({*arm.joints}) == len(arm.joints) == len(arm.low)
     assert (arm.max_speed > 0.3).all() and (arm.max_acceleration > 0.7).all()  # in rad, not in degrees or turns
     assert (arm.max_speed < 7).all() and (np.abs(arm.low) < 7).all() and (np.abs(arm.high) < 7).all()
+
+
+def test_the_tool_brakes_early_enough_to_stop_within_the_workspace(limiter: JointLimiter) -> None:
+    """A tool whose x is the first joint [m], which takes 10 cm to stop from full speed."""
+
+    def forward(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        pose = np.eye(4)
+        pose[0, 3] = joints[0]
+        return pose, np.zeros((6, 2))
+
+    workspace = _Workspace(forward, -np.ones(3), np.array([0.4, 1.0, 1.0]))
+    commands = [limiter.position.copy()]
+    for _ in range(200):
+        workspace.step(limiter, np.array([0.9, 0.0]), 0.0)
+        commands.append(limiter.position.copy())
+    assert 0.35 < np.max(commands) <= 0.4 + LEEWAY
+    assert_within_limits(commands)
