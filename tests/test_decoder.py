@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from defaults import defaults_of
 from fake_batch import MOTIONS, make_decoder, make_rt1, with_motions
+from saved_policies import save_policy
 from toy import SPEC
 
 from vla.models.decoder import Decoder
 from vla.models.model import Model
+from vla.models.policy_folder import read_policy
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile
 from vla.models.tokenizers.tokenizer import RT1Bins
@@ -33,6 +37,7 @@ MODELS: dict[str, Callable[[], Decoder]] = {
 
 @pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
 def test_writing_with_a_cache_is_decoding_the_growing_sequence_again_and_again(make: Callable[[], Decoder]) -> None:
+    torch.manual_seed(0)  # of two tokens that are nearly as likely either may be written
     model = make()
     with torch.no_grad():
         for parameter in model.parameters():  # many biases are 0 at first, and would not be missed
@@ -50,6 +55,15 @@ def test_writing_with_a_cache_is_decoding_the_growing_sequence_again_and_again(m
             written = torch.cat([written, again[:, -1:].argmax(-1)], 1)
         assert torch.equal(written, tokens)
     assert len(tokens.unique()) > 1
+
+
+def test_the_words_of_fast_tokens_come_with_the_policy(tmp_path: Path) -> None:
+    model = make_fast().eval()
+    other = make_decoder(chunk=4, tokenizer=Fast(bins=256, chunk=4, spec=SPEC, scale=10.0)).eval()  # without words
+    node: dict[str, Any] = {"task": {}, "tokenizer": {}, "model": {}}
+    read_policy(save_policy(tmp_path, node, state=model.state_dict())).restore(other)
+    batch = with_motions(model)
+    assert torch.equal(other.predict(batch).actions, model.predict(batch).actions)
 
 
 def test_a_token_depends_on_those_before_it_and_on_no_later_one() -> None:

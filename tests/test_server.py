@@ -239,17 +239,21 @@ def test_the_encoding_is_documented() -> None:
 
 
 @pytest.mark.parametrize(
-    ("library", "target"),
-    [("msgpack", "vla.deploy.server.PolicyServer"), ("websockets", "vla.rollouts.remote.RemotePolicy")],
+    ("library", "extra", "target"),
+    [
+        ("msgpack", "server", "vla.deploy.server.PolicyServer"),
+        ("websockets", "server", "vla.rollouts.remote.RemotePolicy"),
+        ("transformers", "vlm", "vla.models.vlm.smolvla.SmolVLA"),
+    ],
 )
 def test_what_is_missing_is_said_with_how_to_install_it(
-    monkeypatch: pytest.MonkeyPatch, library: str, target: str
+    monkeypatch: pytest.MonkeyPatch, library: str, extra: str, target: str
 ) -> None:
     for module in [*sys.modules]:
         if module in ("vla.io.array_messages", target.rpartition(".")[0]) or module.startswith(f"{library}."):
             monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(MissingLibrary, match=rf"{library}.* its extra server: pip install -e '\.\[server\]'"):
+    with pytest.raises(MissingLibrary, match=rf"{library}.* its extra {extra}: pip install -e '\.\[{extra}\]'"):
         locate("here", target)
 
 
@@ -372,7 +376,8 @@ def test_what_cannot_be_served_is_said_in_a_sentence() -> None:
             settings(policy, port=port).run()
 
 
-def test_it_serves_until_it_is_told_to_stop(caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_serves_until_it_is_told_to_stop(number: signal.Signals, caplog: pytest.LogCaptureFixture) -> None:
     asked = []
 
     def stop() -> None:
@@ -381,7 +386,7 @@ def test_it_serves_until_it_is_told_to_stop(caplog: pytest.LogCaptureFixture) ->
             time.sleep(0.01)
         url = caplog.messages[0].removeprefix("serving the policy at ").replace("ws://", "http://")
         asked.append(urlopen(f"{url}/healthz").read())
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), number)
 
     with caplog.at_level(logging.INFO, "vla.deploy.server"):
         thread = threading.Thread(target=stop, daemon=True)

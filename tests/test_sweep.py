@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from rich.console import Console
 
+from vla.io.errors import UserError
 from vla.jobs.sweep import SweepTable
 from vla.reports.comparison import Compared, common_episodes, compare
 from vla.reports.comparison_page import results_table, tabulate
@@ -25,8 +26,9 @@ from vla.rollouts.comparison import SUCCESS, compare_samples
 from vla.rollouts.results import Report, Result
 from vla.rollouts.sequential import anytime_interval
 from vla.rollouts.statistics import pooled_interval
+from vla.run import SWEEP, _end
 from vla.runs.folder import read_run
-from vla.runs.sweep import SweepRow, read_rows
+from vla.runs.sweep import SweepRow, read_rows, save_failure
 from vla.spec import FIRST_SEED
 
 
@@ -138,6 +140,20 @@ def test_of_many_cells_the_table_is_written_after_some_and_at_the_end(tmp_path: 
     assert written == [True] * 10 + [False] * 3
     SweepTable().on_multirun_end(config)
     assert page.exists()
+
+
+def test_where_a_cell_fails_the_table_has_the_others_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for number in range(13):
+        cell(tmp_path, number, [f"data.seed={number}"], 9)
+    save_failure(tmp_path / "2", "no room")
+    (error := UserError("no room")).add_note(f"{SWEEP}{tmp_path}")  # of the first cell that failed, when all have ended
+    with pytest.raises(SystemExit):
+        _end(error)
+    assert capsys.readouterr().err == (
+        f"error: 1 of 13 cells failed, see error.txt of each in {tmp_path}\n  2 data.seed=2: no room\n"
+    )
+    told = (tmp_path / "sweep.md").read_text()
+    assert "| 12 | 90.0 (" in told and "- failed: 2 data.seed=2: no room" in told
 
 
 def test_agents_without_a_model_are_rows_too(tmp_path: Path) -> None:

@@ -201,9 +201,14 @@ def _end(error: Exception) -> NoReturn:
     """End the program: in one sentence, unless the error is a bug or the user wants its traceback."""
     for note in getattr(error, "__notes__", ()):
         if note.startswith(SWEEP):
+            from vla.io.files import warn_on_error
+            from vla.jobs.sweep import write_table
             from vla.runs.sweep import describe_failures
 
-            print(printable(f"error: {describe_failures(Path(note.removeprefix(SWEEP)))}"), file=sys.stderr)
+            folder = Path(note.removeprefix(SWEEP))
+            with warn_on_error(folder):
+                write_table(folder)  # Hydra leaves it to us: see `SweepTable.on_multirun_end`
+            print(printable(f"error: {describe_failures(folder)}"), file=sys.stderr)
             sys.exit(1)
     if os.environ[TRACEBACKS] == "1" or not _is_mendable(error):
         raise error

@@ -79,9 +79,10 @@ def _how_to_install(module: str) -> str:
         requirements = requires("vla") or []
     except PackageNotFoundError:  # it runs from its folder
         return ""
-    pattern = rf"{re.escape(module.partition('.')[0])}\b.*extra == '(?!dev')(\w+)'"
-    extras = [found[1] for each in requirements if (found := re.match(pattern, each))]
-    return f"; install this package with its extra {extras[0]}: pip install -e '.[{extras[0]}]'" if extras else ""
+    pattern = rf"{re.escape(module.partition('.')[0])}\b.*extra == '(\w+)'"
+    # In alphabetical order: of those with transformers, vlm is what the classes that import it with themselves need.
+    *_, extra = ["", *(found[1] for each in requirements if (found := re.match(pattern, each)))]
+    return f"; install this package with its extra {extra}: pip install -e '.[{extra}]'" if extra else ""
 
 
 def require_trusted(source: object, target: Any, imported: bool = False) -> None:

@@ -54,7 +54,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
 
 
 def remove_drafts(*targets: Path) -> None:
-    """Remove what killed processes left of `atomic_path`; no other process may write these targets meanwhile."""
+    """Remove drafts of `atomic_path` that killed processes left; no other process may write these targets meanwhile."""
     for target in targets:
         for draft in target.parent.glob(f".{'[0-9a-f]' * 8}.{target.name}"):
             shutil.rmtree(draft, ignore_errors=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 from hydra.core.utils import JobReturn, JobStatus
@@ -13,6 +13,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from vla.io.printable import show
+
+if TYPE_CHECKING:
+    from vla.runs.sweep import SweepRow
 
 LOCK = ".lock"  # in the folder of a sweep
 EVERY = 10  # cells between two tables once there are so many, because a table reads all of them
@@ -36,26 +39,32 @@ class SweepTable(Callback):
 
             if job_return.status == JobStatus.COMPLETED:  # from a concurrent sweep in this folder
                 (Path(config.hydra.runtime.output_dir) / FAILURE).unlink(missing_ok=True)
-            from vla.reports.comparison_page import tabulate  # imports matplotlib
-
             folder = Path(config.hydra.sweep.dir)
-            with FileLock(folder / LOCK):  # the last holder of the lock writes all cells
-                ended = len({*cells(folder, REPORT), *cells(folder, FAILURE)})
-                if ended <= EVERY or ended % EVERY == 0:
-                    tabulate(folder)
+            ended = len({*cells(folder, REPORT), *cells(folder, FAILURE)})
+            if ended <= EVERY or ended % EVERY == 0:
+                write_table(folder)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Print the table of the sweep, and name its page; end the process with an error if there are no cells."""
-        from vla.reports.comparison_page import SWEEP, results_table, tabulate  # imports matplotlib
+        """Print the table of the sweep, and name its page; end the process with an error if there are no cells.
+
+        After a cell failed Hydra does not call this, and `vla.run` writes the table.
+        """
+        from vla.reports.comparison_page import SWEEP, results_table  # imports matplotlib
         from vla.runs.sweep import OVERRIDES, cells
 
         folder = Path(config.hydra.sweep.dir)
         if not (folder.is_dir() and cells(folder, OVERRIDES)):
             print("error: the sweep has no cells: one of its ranges or choices is empty", file=sys.stderr)
             sys.exit(1)
-        with FileLock(folder / LOCK):
-            rows = tabulate(folder)
-        if rows:
+        if rows := write_table(folder):
             show(results_table(rows))
         if (page := folder / SWEEP).exists():
             print(f"wrote {page}")
+
+
+def write_table(folder: Path) -> list[SweepRow]:
+    """Write the table of all cells of a sweep that have ended, and return its rows."""
+    from vla.reports.comparison_page import tabulate  # imports matplotlib
+
+    with FileLock(folder / LOCK):  # the last holder of the lock writes all cells
+        return tabulate(folder)
