@@ -186,11 +186,12 @@ def test_a_late_answer_still_ends_where_and_when_it_should(world: World) -> None
     ("break_it", "reason"),
     [
         (lambda world: setattr(world, "cameras", ["front"]), "camera wrist is older"),
+        (lambda world: setattr(world, "cameras", []), "camera front is older"),
         (lambda world: setattr(world, "apart", 0.08), "images of front, wrist are more than 0.05 s apart"),
         (lambda world: setattr(world, "measures", False), "joint state is older"),
         (lambda world: setattr(world, "answer", lambda observation: None), "inference takes longer"),
     ],
-    ids=["one camera", "cameras out of step", "no joint states", "no answer"],
+    ids=["one camera", "no camera", "cameras out of step", "no joint states", "no answer"],
 )
 def test_late_inputs_brake_and_hold_the_arm(world: World, break_it: Callable[[World], None], reason: str) -> None:
     world.run(0.3)

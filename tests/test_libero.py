@@ -221,7 +221,7 @@ def test_a_knob_at_zero_is_not_off_and_the_planner_turns_it_further() -> None:
         solved(environment, FIRST_SEED)
 
 
-@pytest.mark.parametrize("name", ["goal 0", "object 3"])  # a drawer, a bottle
+@pytest.mark.parametrize("name", ["goal 0", "object 3", "spatial 0"])  # a drawer, a bottle, a bowl by its rim
 def test_the_planner_solves(name: str) -> None:
     with closing(world(name)) as environment, environment.blind():
         solved(environment, 1)

@@ -226,6 +226,12 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
         weights(lambda state: {name: value.half() for name, value in state.items()}),
         r"does not fit the model .* numbers of torch\.float16, not torch\.float32",
     ),
+    "a header beyond the file": (
+        lambda folder: (folder / "model.safetensors").write_bytes(b"\xff" * 8 + bytes(99)) and _sign(folder),
+        r"model\.safetensors is damaged: ",
+    ),
+    "a shape that overflows": (resized(lambda header: first(header).update(shape=[2**63, 2**63])), "is damaged: "),
+    "an unknown kind of number": (resized(lambda header: first(header).update(dtype="X9")), "is damaged: "),
     "a further name": (weights(lambda state: {**state, "..": torch.ones(1)}), "does not fit the model"),
     "a missing name": (weights(lambda state: dict([*state.items()][1:])), "does not fit the model"),
     "another shape": (
