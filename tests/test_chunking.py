@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from tiny_vla import make_smolvla
 from torch import Tensor
 from toy import SPEC, ToyEnvironment, make_environment
 
+from vla.config.build import build
 from vla.config.experiment import Experiment
 from vla.jobs.evaluate import require_possible
 from vla.models.chunking import Chunking, Guided, Running, TrainedPrefix, require_fit
@@ -365,3 +367,14 @@ def test_what_follows_the_prefix_is_learned_by_vision_language_action_models(nam
     late = (torch.arange(model.chunk) >= 2).long().expand_as(batch["perturbations"])
     assert error(perturbations=late * torch.tensor([1, 0])[:, None, None]) == expected  # it was given
     assert error(perturbations=late * torch.tensor([0, 1])[:, None, None]) != expected
+
+
+def test_a_method_without_its_library_says_which_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    def without_library(self: TrainedPrefix) -> None:
+        import_module("no_such_library")
+
+    monkeypatch.setattr(TrainedPrefix, "__init__", without_library, raising=False)
+    options = {"device": "cpu", "precision": "fp32", "compile": False, "lanes": 1}
+    node = {"_target_": "vla.policy.Policy", **options, "chunking": {"_target_": "vla.models.chunking.TrainedPrefix"}}
+    with pytest.raises(ValueError, match=r"policy needs a library that is not installed: .*no_such_library"):
+        build(node, "policy", model=make_flow(), spec=SPEC)

@@ -12,6 +12,7 @@ import toy
 import warm
 from command_line import SMALL, vla
 from defaults import defaults_of
+from lightning_utilities.core.imports import RequirementCache
 from resuming import STOP, same
 from together import PAIRS, TRUNK, composed, train, train_trunk, untrained
 from trunk import make_trunk_model
@@ -106,20 +107,25 @@ def test_two_processes_go_on_with_the_same_bits(together: Path) -> None:
     ],
 )
 def test_what_the_machine_lacks_is_said_before_anything_is_done(
-    overrides: tuple[str, ...], environment: dict[str, str], says: str, monkeypatch: pytest.MonkeyPatch
+    overrides: tuple[str, ...], environment: dict[str, str], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     on = [] if overrides == ("trainer=fsdp",) else ["trainer.accelerator=cpu"]
     with pytest.raises(ValueError, match=f"is not available here .*{says}.* trainer=auto trainer.accelerator=auto"):
-        make_trainer(composed("model=rt1_tiny", *overrides, *on).config, None)
+        make_trainer(composed("model=rt1_tiny", *overrides, *on).config, tmp_path)
 
 
-def test_what_lightning_refuses_is_not_blamed_on_the_machine() -> None:
+def test_what_lightning_refuses_is_not_blamed_on_the_machine(tmp_path: Path) -> None:
+    wrong = "trainer.accelerator=cpu", "+trainer.gradient_clip_algorithm=nrom"
     with pytest.raises(ValueError, match=r"^Lightning refuses the trainer: .*algorithm"):
-        make_trainer(
-            composed("model=rt1_tiny", "trainer.accelerator=cpu", "+trainer.gradient_clip_algorithm=nrom").config, None
-        )
+        make_trainer(composed("model=rt1_tiny", *wrong).config, tmp_path)
+
+
+def test_a_logger_without_its_library_says_which_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lightning.pytorch.loggers.wandb._WANDB_AVAILABLE", RequirementCache("no-such-library"))
+    with pytest.raises(ValueError, match=r"logger needs a library that is not installed: .*no-such-library"):
+        make_trainer(composed("model=rt1_tiny", "logger=wandb").config, tmp_path)
 
 
 def test_ddp_trains_on_two_processes_and_evaluates_once(home: Path) -> None:

@@ -21,8 +21,6 @@ def out(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> io.S
     """What rich prints, on a terminal of 80 columns if the test asks for one."""
     console = Console(file=io.StringIO(), force_terminal=getattr(request, "param", False), width=80)
     monkeypatch.setattr("rich._console", console)
-    asked = Console(file=io.StringIO(), force_terminal=console.is_terminal)  # Lightning configures the other one anew
-    monkeypatch.setattr(progress, "get_console", lambda: asked)
     monkeypatch.setattr(progress, "EVERY", 0.0)
     return console.file  # type: ignore[return-value]
 
@@ -48,32 +46,20 @@ def test_lines_do_not_follow_each_other_closely(
     assert not caplog.messages
 
 
-def bar_of(trainer: Any) -> TrainingProgressBar:
-    """The bar of a training."""
-    trainer.progress_bar_callback = bar = TrainingProgressBar()
-    bar._trainer = trainer
-    bar._init_progress(trainer)
-    assert bar.progress is not None
-    bar.train_progress_bar_id = bar.progress.add_task("training  ", total=20000)
-    return bar
-
-
-def test_a_training_is_one_line(out: io.StringIO, caplog: pytest.LogCaptureFixture) -> None:
-    logged = {"val/success": 0.85, "pace/samples_per_s": 1234.0, "pace/waiting": 0.01}
+@pytest.mark.parametrize(("steps", "of"), [(20000, " of 20000"), (-1, "")])
+def test_a_training_is_one_line(steps: int, of: str, out: io.StringIO, caplog: pytest.LogCaptureFixture) -> None:
     trainer: Any = SimpleNamespace(
-        callback_metrics=logged,
-        state=SimpleNamespace(fn="fit"),
-        sanity_checking=False,
-        training=True,
-        max_steps=20000,
+        callback_metrics={"val/success": 0.85, "pace/samples_per_s": 1234.0, "pace/waiting": 0.01},
+        is_global_zero=True,
+        max_steps=steps,
         accumulate_grad_batches=1,
     )
-    bar, learner = bar_of(trainer), make_learner()
+    bar, learner = TrainingProgressBar(), make_learner()
     with caplog.at_level("INFO"):
         bar.on_train_batch_end(trainer, learner, {"loss": torch.tensor(12.5)}, {}, 1998)
-    assert bar.progress is not None
-    console = Console(file=io.StringIO(), width=80)
-    console.print(bar.progress.get_renderable())
-    (line,) = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
-    assert "1999/20000" in line and "loss: 12.500 success: 85%" in line and "…" not in line
-    assert caplog.messages == ["training: 1999 of 20000, loss 12.500, success 85%"]
+        bar.on_train_end(trainer, learner)
+    (line,) = filter(None, out.getvalue().splitlines())
+    notes = "loss 12.500, 1234 samples/s, success 85%"
+    assert f"1999/{steps if of else '?'} {notes}" in line and "…" not in line
+    (said,) = caplog.messages
+    assert said.startswith(f"training: 1999{of}, {notes}")

@@ -12,6 +12,7 @@ from multiprocessing import active_children
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock, call
 
 import lightning
 import pytest
@@ -343,15 +344,12 @@ def test_where_gradients_are_accumulated_nothing_is_saved_within_a_step(tmp_path
     assert saved == [2 * SAVE_EVERY]
 
 
-def test_the_progress_bar_shows_the_loss_of_the_first_step_after_resuming_and_nothing_before(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("lightning.pytorch.callbacks.RichProgressBar.on_train_batch_end", lambda *_: None)
-    trainer: Any = SimpleNamespace(callback_metrics={}, accumulate_grad_batches=2)
-    bar, module = TrainingProgressBar(), make_learner()
-    assert bar.get_metrics(trainer, module) == {}
-    shown = []
+def test_the_progress_bar_shows_the_loss_of_the_first_step_after_resuming_and_the_share_of_waiting() -> None:
+    logged = {"pace/waiting": torch.tensor(0.1)}
+    trainer: Any = SimpleNamespace(callback_metrics=logged, accumulate_grad_batches=2, is_global_zero=True)
+    bar, module, shown = TrainingProgressBar(), make_learner(), Mock()
+    bar._bar = shown
     for batch in (5, 6, 10):
         bar.on_train_batch_end(trainer, module, {"loss": torch.tensor(batch / 8)}, {}, batch)
-        shown.append(bar.get_metrics(trainer, module)["loss"])
-    assert shown == ["1.250", "1.250", "2.500"]
+    notes = [f"loss {loss}, waiting 10%" for loss in ("1.250", "1.250", "2.500")]
+    assert shown.show.call_args_list == [call(done, note) for done, note in zip((6, 7, 11), notes, strict=True)]

@@ -4,12 +4,13 @@
 
 from __future__ import annotations
 
-import time
+import timeit
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import chain
+from math import isfinite
 from typing import Any, Literal
 
 import numpy as np
@@ -267,10 +268,7 @@ class Policy:
         spec = self.spec
         if observation.state.shape != (len(spec.state),):
             raise UserError(f"the policy's state is {spec.state}, the observation's {observation.state.shape}")
-        if not np.isfinite(observation.state).all():
-            wrong = [
-                name for name, finite in zip(spec.state, np.isfinite(observation.state), strict=True) if not finite
-            ]
+        if wrong := [name for name, value in zip(spec.state, observation.state, strict=True) if not isfinite(value)]:
             raise UserError(f"the observation's state is not finite in {', '.join(wrong)}")
         rgb = spec.images(observation)
         if missing := [camera for camera in spec.cameras if camera not in rgb]:
@@ -316,9 +314,5 @@ def latency(policy: Policy) -> float:
     observation = policy.spec.random_observation(np.random.default_rng(0))
     for _ in range(policy.model.history):
         policy.plan(observation)
-    seconds = []
-    for _ in range(25):
-        started = time.perf_counter()
-        policy.plan(observation)
-        seconds.append(time.perf_counter() - started)
+    seconds = timeit.repeat(lambda: policy.plan(observation), number=1, repeat=25)
     return 1000 * float(np.median(np.reshape(seconds, (5, 5)), axis=1).min())

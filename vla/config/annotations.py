@@ -64,7 +64,7 @@ def locate(key: str, target: Any) -> type:
     except (ImportError, AttributeError) as error:
         where = "" if target.startswith(OWN) else f" on {gethostname()}, where {package} must be installed"
         library = isinstance(error, ModuleNotFoundError) and not f"{error.name}.".startswith(f"{package}.")
-        kind, hint = (MissingLibrary, _how_to_install(str(error.name))) if library else (UserError, "")
+        kind, hint = (MissingLibrary, how_to_install(str(error.name))) if library else (UserError, "")
         raise kind(f"{key} is {target}, which cannot be imported{where}: {error}{hint}") from error
     # A module's attributes include its imports, such as `os`.
     defined = isinstance(found, type) and found.__module__.partition(".")[0] in (OWN.rstrip("."), package)
@@ -73,7 +73,7 @@ def locate(key: str, target: Any) -> type:
     return found
 
 
-def _how_to_install(module: str) -> str:
+def how_to_install(module: str) -> str:
     """Return how to install the extra of this package that a module belongs to, if it belongs to one."""
     try:
         requirements = requires("vla") or []

@@ -24,6 +24,7 @@ from hydra.utils import instantiate
 from vla.config.annotations import (
     MissingLibrary,
     fits,
+    how_to_install,
     is_node,
     locate,
     mismatch,
@@ -117,18 +118,22 @@ def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
 
     Nested nodes are built first; those with `_partial_: true` become factories; `runtime` is from the program.
     Unresolved references such as `${seed}` are refused, so the checked mapping is the one that is built. There is a
-    UserError for a class that is not allowed or of another kind, wrong arguments, or an error of the constructor.
+    UserError for a class that is not allowed or of another kind, wrong arguments, an error of the constructor, or a
+    library that it imports and that is not installed.
     """
     group = GROUPS[group] if isinstance(group, str) else group
     node = resolved(node, group.name)
     check_node(group.name, node, makes(group), tuple(runtime))
     try:
-        factory = instantiate(node, _convert_="all", _partial_=True, _recursive_=not group.plain)
-    except InstantiationException as error:
-        if isinstance(error.__cause__, ValueError):
-            raise UserError(str(error.__cause__)) from error
+        return instantiate(node, _convert_="all", _partial_=True, _recursive_=not group.plain)(**runtime)
+    except (InstantiationException, ModuleNotFoundError) as error:
+        cause = error.__cause__ if isinstance(error, InstantiationException) else error  # of a node within, or of this
+        if isinstance(cause, ModuleNotFoundError):
+            hint = how_to_install(str(cause.name))
+            raise UserError(f"{group.name} needs a library that is not installed: {cause}{hint}") from error
+        if isinstance(cause, ValueError):
+            raise UserError(str(cause)) from error
         raise
-    return factory(**runtime)
 
 
 @cache

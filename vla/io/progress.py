@@ -6,44 +6,35 @@ import logging
 import time
 from datetime import timedelta
 
-from rich import get_console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Column
 
 log = logging.getLogger(__name__)
 
 EVERY = 60.0  # between two lines [s]
 
 
-class Lines:
-    """Logs how far a work is where no bar is painted before its end: in a job of a cluster, or under nohup."""
-
-    def __init__(self) -> None:
-        self._said = time.monotonic()
-
-    def are_due(self) -> bool:
-        """Return whether there is neither a terminal nor a recent line."""
-        return time.monotonic() - self._said >= EVERY and not get_console().is_terminal
-
-    def say(self, label: str, done: int, total: float, note: str, left: float | None) -> None:
-        """Log `done` of `total`, a note, and the time that is left [s] if it is known."""
-        self._said = time.monotonic()
-        time_left = "" if left is None else f"{timedelta(seconds=round(left))} left"
-        of = f" of {total:.0f}" if total < float("inf") else ""
-        log.info("%s", ", ".join(filter(None, (f"{label}: {done}{of}", note, time_left))))
-
-
 class Bar(Progress):
-    """Progress of episodes, with a label before the bar and a note behind it."""
+    """A bar with a label before it and a note behind it.
 
-    def __init__(self, label: str, total: int, done: int = 0, note: str = "") -> None:
-        columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
-        super().__init__(*columns, TimeRemainingColumn())
-        self._label, self._lines = label, Lines()
+    Lines are logged where it is not painted before its end: in a job of a cluster, or under nohup.
+    """
+
+    def __init__(self, label: str, total: int | None, done: int = 0, note: str = "") -> None:
+        """Without a `total` the work has no known end."""
+        count = MofNCompleteColumn(table_column=Column(no_wrap=True))  # so only the bar gives way to a long note
+        columns = (TextColumn(label), BarColumn(bar_width=None), count, TextColumn("{task.description}"))
+        # Painting takes milliseconds, in a thread that the work waits for.
+        super().__init__(*columns, TimeRemainingColumn(), refresh_per_second=4)
+        self._label, self._said = label, time.monotonic()
         self.add_task(note, total=total, completed=done)
 
     def show(self, done: int, note: str = "") -> None:
         """Show that so many are done."""
         (task,) = self.tasks
         self.update(task.id, completed=done, description=note)
-        if self._lines.are_due():
-            self._lines.say(self._label, done, task.total or 0, note, task.time_remaining)
+        if time.monotonic() - self._said >= EVERY and not self.console.is_terminal:
+            self._said, left = time.monotonic(), task.time_remaining
+            of = "" if task.total is None else f" of {task.total:.0f}"
+            time_left = "" if left is None else f"{timedelta(seconds=round(left))} left"
+            log.info("%s", ", ".join(filter(None, (f"{self._label}: {done}{of}", note, time_left))))

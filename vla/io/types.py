@@ -5,7 +5,6 @@ Validation also requires every float to be finite.
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
@@ -15,7 +14,7 @@ from annotated_types import Ge, Gt, Le, Lt, MinLen, Predicate
 
 def ascending(values: Sequence[float]) -> bool:
     """in ascending order"""
-    return all(low <= high for low, high in itertools.pairwise(values))
+    return list(values) == sorted(values)
 
 
 def unique(values: Sequence[Any]) -> bool:

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from functools import cache
-from importlib.metadata import distributions
-from typing import Any
+from importlib.metadata import PackageNotFoundError, distributions, version
 
 
 @cache  # reading all metadata takes a third of a second
 def installed_versions() -> dict[str, str]:
     """Return name → version of vla, of packages made for it, and of what they require, as far as it is installed."""
-    installed: dict[str, Any] = {}
+    listed = set[str]()
     for each in distributions():
-        if each.name:  # an interrupted installation leaves nameless ones; of several copies the first one is imported
-            installed.setdefault(normal_name(each.name), each)
-    needed = {
-        name: [normal_name(re.split(r"[^\w.-]", text)[0]) for text in each.requires or ()]
-        for name, each in installed.items()
-    }
-    ours = {name: names for name, names in needed.items() if name == "vla" or "vla" in names}
-    listed = [*ours, *(name for names in ours.values() for name in names)]
-    return {name: installed[name].version for name in sorted({*listed}) if name in installed}
-
-
-def normal_name(name: str) -> str:
-    """Return the name of a distribution in the spelling by which names are compared (PEP 503)."""
-    return re.sub(r"[-_.]+", "-", name).lower()
+        names = {each.name, *(re.split(r"[^\w.-]", text)[0] for text in each.requires or ())}
+        if "vla" in names and each.name:  # an interrupted installation leaves nameless ones
+            listed |= names
+    found = dict[str, str]()
+    for name in sorted(listed):
+        with suppress(PackageNotFoundError):
+            found[name] = version(name) or "unknown"
+    return found

@@ -69,11 +69,11 @@ class WorkerProcess:
     def answer(self) -> Any:
         """Receive the next answer; raises as `ask` does."""
         try:
-            result, error, remote = pickle.loads(self._connection.recv_bytes())
+            result, error = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError) as end:
             raise ProcessEnded(self._how_it_ended()) from end
         if error is not None:
-            raise error from _RemoteTraceback(f"\n{remote}")
+            raise error
         return result
 
     def _how_it_ended(self) -> str:
@@ -103,10 +103,6 @@ class WorkerProcess:
         self._process.join()
 
 
-class _RemoteTraceback(Exception):
-    """Traceback of another process, as text."""
-
-
 def _serve(connection: Connection, make: bytes, number: int) -> None:
     """Create a worker and process items until the connection is closed."""
     os.environ[WORKER] = str(number)
@@ -125,11 +121,13 @@ def _serve(connection: Connection, make: bytes, number: int) -> None:
 
 
 def _outcome(function: Callable[..., Any], *arguments: Any) -> bytes:
-    """Call a function; returns its result, its error and the traceback of that, pickled."""
+    """Call a function; returns its result and its error, with the traceback as a note, pickled."""
     try:
-        return pickle.dumps((function(*arguments), None, ""))
+        return pickle.dumps((function(*arguments), None))
     except Exception as error:  # of any kind, that of pickling included: the parent raises it
-        return pickle.dumps((None, portable(error), traceback.format_exc()))
+        told = portable(error)
+        told.add_note(f"\nIn the worker process:\n{traceback.format_exc()}")
+        return pickle.dumps((None, told))
 
 
 def portable(error: BaseException) -> BaseException:

@@ -30,7 +30,6 @@ COLOURS = (GREEN, BLUE, RED, "#d9942b", "#8a5bb8", "#2f9fa3", "#b5628f", GREY)  
 INK = "#010203"  # black, and on a page the colour of its text
 MIDDLE = "#7a7f86"  # readable on white and on black, of PNG files on a page
 SIZE = (3.4, 2.3)  # of a panel [inch]
-RIGHT, BOTTOM, TOP = 0.96, 0.12, 0.96  # ends of its axes on a page
 
 
 def error_bars(rates: Iterable[Interval]) -> tuple[Array, Array]:
@@ -119,13 +118,8 @@ def svgs(panels: Panels) -> dict[str, Markup]:
 def _svg(title: str, draw: Callable[[Axes], object]) -> Markup:
     file = io.StringIO()
     with _style(), matplotlib.rc_context({"svg.hashsalt": title}):  # identifiers are unique on a page
-        figure = Figure(SIZE)
-        axes = figure.add_axes((0.0, BOTTOM, RIGHT, TOP - BOTTOM))
-        draw(axes)
-        # Only the left margin depends on what is drawn; a layout engine takes as long as drawing the figure twice.
-        box = axes.yaxis.get_tightbbox()
-        left = 0.01 - min(0.0, box.x0 if box else 0.0) / figure.bbox.width
-        axes.set_position((left, BOTTOM, RIGHT - left, TOP - BOTTOM))
+        figure = Figure(SIZE, layout="constrained")
+        draw(figure.add_subplot())
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
     svg = file.getvalue()
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil, log, sqrt
@@ -22,15 +23,12 @@ def episodes_needed(power: Callable[[int], float], enough: float) -> int | None:
 
     As outcomes are discrete, power may fall below it again by a little for a few larger numbers.
     """
-    low, high = 0, 1
+    high = 1
     while power(high) < enough:
         if high == MOST:
             return None
-        low, high = high, min(2 * high, MOST)
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if power(middle) >= enough else (middle, high)
-    return high
+        high = min(2 * high, MOST)
+    return bisect_left(range(high), enough, high // 2 + 1, key=power)
 
 
 def power_for_bar(episodes: int, rate: float, bar: float) -> float:
@@ -60,12 +58,11 @@ def power_of_pairs(episodes: int, discordant: float, difference: float) -> float
 
 def power_of_samples(episodes: int, one: float, other: float) -> float:
     """Return the probability that Fisher's exact test finds the difference of two rates, each of so many episodes."""
-    from scipy.special import gammaln
     from scipy.stats import binom
 
     one, other = sorted((one, other))
     every = np.arange(episodes + 1)
-    ways = gammaln(episodes + 1) - gammaln(every + 1) - gammaln(episodes - every + 1)
+    ways = binom.logpmf(every, episodes, 0.5)  # and a constant, which cancels
     first, second = (binom.pmf(every, episodes, rate) for rate in (one, other))
     reach = FAR * sqrt(episodes * max(one * (1 - one), other * (1 - other))) + FAR
     low, high = max(0, int(episodes * one - reach)), min(episodes, int(episodes * other + reach))

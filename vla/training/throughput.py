@@ -7,11 +7,8 @@ from typing import Any
 
 import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import RichProgressBar
-from rich.progress import TimeRemainingColumn
-from rich.table import Column
 
-from vla.io.progress import Lines
+from vla.io.progress import Bar
 
 MUCH = 0.05  # share of the time that waits for data, above which the bar shows it
 
@@ -65,59 +62,45 @@ def _waited(trainer: Trainer) -> float:
     return float(getattr(trainer.train_dataloader, "waited", 0.0))
 
 
-class TrainingProgressBar(RichProgressBar):
-    """Progress bar over training steps.
+class TrainingProgressBar(Callback):
+    """Progress bar over the batches of a training, with loss, throughput, success, and the share of waiting if it is
+    much.
 
     Lightning's own bar labels training without epochs "Epoch 0/-2", and restarts at 0 after resuming.
     """
 
-    READ_EVERY = 10  # steps; each read synchronises the GPU
+    READ_EVERY = 10  # batches; each read synchronises the GPU
 
     def __init__(self) -> None:
-        super().__init__(refresh_rate=4)  # a second: painting takes milliseconds, in a thread that the model waits for
+        self._bar: Bar | None = None  # of the first process, from the first batch on
         self._loss: float | None = None  # unknown before the first step, also after resuming
-        self._lines = Lines()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Advance the bar; read the loss every `READ_EVERY` batches."""
+        parts, logged = trainer.accumulate_grad_batches, trainer.callback_metrics
         if self._loss is None or batch_idx % self.READ_EVERY == 0:
-            self._loss = outputs["loss"].item() * trainer.accumulate_grad_batches  # Lightning divides it by these
-        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
-        if self.is_enabled and self._lines.are_due():
-            note = ", ".join(f"{name} {value}" for name, value in self.get_metrics(trainer, pl_module).items())
-            self._lines.say("training", batch_idx + 1, self.total_train_batches, note, self._time_left())
-
-    def _time_left(self) -> float | None:
-        tasks = {task.id: task for task in self.progress.tasks} if self.progress else {}
-        return tasks[self.train_progress_bar_id].time_remaining if self.train_progress_bar_id in tasks else None
-
-    def configure_columns(self, trainer: Trainer) -> list[Any]:
-        """Return what fits in a line of 80 columns beside the metrics, which would else take several lines."""
-        description, bar, batches, _, speed = super().configure_columns(trainer)
-        self._metric_component._table_column = Column(no_wrap=True)  # type: ignore[union-attr]
-        return [description, bar, batches, TimeRemainingColumn(), speed]
-
-    @property
-    def total_train_batches(self) -> int | float:
-        """Return the batches of the whole training; infinity if only its time is limited."""
-        trainer = self.trainer
-        return trainer.max_steps * trainer.accumulate_grad_batches if trainer.max_steps > 0 else float("inf")
-
-    def get_metrics(
-        self, trainer: Trainer, pl_module: LightningModule
-    ) -> dict[str, int | str | float | dict[str, float]]:
-        """Return the columns beside the bar: loss, share of waiting for data if it is much, success."""
-        logged = trainer.callback_metrics
-        shown: dict[str, int | str | float | dict[str, float]] = {}
-        if self._loss is not None:
-            shown["loss"] = f"{self._loss:.3f}"
-        if logged.get("pace/waiting", 0) > MUCH:
-            shown["waiting"] = f"{logged['pace/waiting']:.0%}"
+            self._loss = outputs["loss"].item() * parts  # Lightning divides it by these
+        if not trainer.is_global_zero:
+            return
+        if self._bar is None:  # not before, because it is painted over what others say at the start
+            total = trainer.max_steps * parts if trainer.max_steps > 0 else None
+            self._bar = Bar("training", total, batch_idx)
+            self._bar.start()
+        notes = [f"loss {self._loss:.3f}"]
+        if "pace/samples_per_s" in logged:
+            notes.append(f"{logged['pace/samples_per_s']:.0f} samples/s")
         if "val/success" in logged:
-            shown["success"] = f"{logged['val/success']:.0%}"
-        return shown
+            notes.append(f"success {logged['val/success']:.0%}")
+        if logged.get("pace/waiting", 0) > MUCH:
+            notes.append(f"waiting {logged['pace/waiting']:.0%}")
+        self._bar.show(batch_idx + 1, ", ".join(notes))
 
-    def _get_train_description(self, current_epoch: int) -> str:
-        return "training".ljust(len(self.validation_description))  # equal lengths avoid flicker
+    def on_train_end(self, *_: Any) -> None:
+        """End the bar, also after an error."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    on_exception = on_train_end

@@ -17,7 +17,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.callbacks import Checkpoint
-from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.plugins.layer_sync import TorchSyncBatchNorm
 from lightning.pytorch.strategies import ParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -73,27 +73,28 @@ class SyncBatchNorm(TorchSyncBatchNorm):
         return synchronised(model)
 
 
-def make_trainer(config: Mapping[str, Any], checkpoints: Path | None, *callbacks: Callback) -> Trainer:
-    """Create the trainer of a config, with EMA and, if a checkpoint folder is given, logging.
+def make_trainer(config: Mapping[str, Any], checkpoints: Path, *callbacks: Callback) -> Trainer:
+    """Create the trainer of a config, with EMA, and logging into the run that has the folder of checkpoints.
 
     The given callbacks run before EMA at the end of a validation, so that they use the EMA weights.
 
     Raises:
-        UserError: the machine lacks what the config requires, or a logger's package is missing.
+        UserError: the machine lacks what the config requires, or a library that a logger needs.
     """
     _keep_freed_memory()
-    decay = config["learner"].get("ema")
+    decay, loggers = config["learner"].get("ema"), (config["logger"] or {}).values()
     trainer = _trainer(
         config["trainer"],
         callbacks=[
             TrainingProgressBar(),
             *callbacks,
             *([EMA(decay)] if decay else []),
-            *([Throughput()] if checkpoints else []),
+            Throughput(),
             StepSeeding(config["seed"]),  # after callbacks that may use random numbers
         ],
-        logger=_loggers(config, checkpoints.parent) if checkpoints else False,
+        logger=[build(node, "logger", save_dir=str(checkpoints.parent)) for node in loggers],
         enable_checkpointing=any(isinstance(each, Checkpoint) for each in callbacks),  # else Lightning adds its own
+        enable_progress_bar=False,
     )
     environment = getattr(trainer.strategy, "cluster_environment", None)
     external = environment is not None and environment.creates_processes_externally
@@ -180,18 +181,6 @@ def _keep_freed_memory() -> None:
         library = ctypes.CDLL(None)
         library.mallopt(MMAP_THRESHOLD, MAX_MMAP_THRESHOLD)
         library.mallopt(TRIM_THRESHOLD, -1)  # never
-
-
-def _loggers(config: Mapping[str, Any], folder: Path) -> list[Logger]:
-    loggers = []
-    for name, node in (config["logger"] or {}).items():
-        try:
-            loggers.append(build(node, "logger", save_dir=str(folder)))
-        except ModuleNotFoundError as error:
-            raise UserError(
-                f"logger.{name} needs a package that is not installed: pip install 'vla[{name}]'"
-            ) from error
-    return loggers
 
 
 def quiet_lightning() -> None:
