@@ -28,6 +28,7 @@ GRAMMAR = {
     "held_out_words": {"lift": ["raise"]},
     "held_out_colours": [],
 }
+SHAPES = {"_target_": "vla.tasks.tabletop.randomize.blocks.Shapes"}
 MASSES = {"_target_": "vla.tasks.tabletop.randomize.blocks.Masses", "factor": [0.5, 2.0]}
 WAYPOINT = {"_target_": "vla.tasks.tabletop.expert.Waypoint", "_partial_": True}
 PERTURBED = {"_target_": "vla.tasks.perturb.Perturbed", "expert": WAYPOINT}
@@ -98,12 +99,22 @@ def test_a_list_of_what_there_is_names_nothing_twice() -> None:
         ("task.goal", MASSES, "task.goal must be Goal or Mixed or Chain, got {'_target_': 'vla.tasks.tabletop.random"),
         ("task.randomize.mass", GRAMMAR, "task.randomize.mass must be Randomizer, got {'_target_': 'vla"),
         ("expert.perturb.start", None, "expert.perturb.start must be a valid number, got null"),
+        ("task.cameras", ["front", "side"], "task.cameras[1] must be 'front' or 'wrist', got 'side'"),
+        ("task.randomize.colour.names", ["mauve"], "task.randomize.colour.names[0] must be 'red', 'green', 'blue', "),
+        ("task.randomize.shape", {**SHAPES, "names": ["ball"]}, "task.randomize.shape.names[0] must be 'cube', 'cyl"),
+        ("task.goal.language.held_out_colours", ["grean"], "task.goal.language.held_out_colours[0] must be 'red', "),
         ("task.meshes", "lite", "task.meshes must be 'light' or 'full', got 'lite', did you mean light?"),
         ("evaluate.recordings", "x", "evaluate.recordings must be 'all' or 'failures' or a valid integer, got 'x'"),
     ],
 )
 def test_a_wrong_value_is_named_with_what_is_allowed(key: str, value: Any, expected: str) -> None:
     assert problem(**{key: value}).startswith(expected)
+
+
+def test_a_digest_that_is_none_is_named_with_its_pattern() -> None:
+    chosen = ("model/image=film_efficientnet_lite0", "model.image.pretrained.sha256=abc")
+    with pytest.raises(ValueError, match=r"^model\.image\.pretrained\.sha256 must match pattern .*, got 'abc'$"):
+        check(composed("job=train", *chosen))
 
 
 def test_a_job_needs_its_groups_and_looks_at_no_others() -> None:
@@ -159,9 +170,8 @@ def test_a_class_takes_the_arguments_of_its_base_classes_too() -> None:
 
 
 def test_build_passes_on_what_a_nested_constructor_complains_about() -> None:
-    axis = {"_target_": "vla.tasks.tabletop.randomize.blocks.Colours", "names": ["pink"], "jitter": 0.0}
-    with pytest.raises(ValueError, match="unknown colours"):
-        build(plain(config(**{"task.randomize": {"colour": axis}}).task), "task")
+    with pytest.raises(ValueError, match="so it replaces no word"):
+        build(plain(config(**{"task.goal.language.phrasings": ["{block}"]}).task), "task")
 
 
 def test_what_is_checked_is_what_is_built() -> None:

@@ -84,7 +84,7 @@ def test_a_model_that_the_hub_has_not_is_named(downloads: list[str]) -> None:
 
 def test_without_the_hub_the_reason_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
-    hubs = {"here": "unknown url", "http://a b": "control", "http://127.0.0.1:9": "refused", "": "OFFLINE"}
+    hubs = {"here": "protocol", "http://a:b": "port", "http://127.0.0.1:9": "refused", "": "OFFLINE"}
     for endpoint, reason in hubs.items():
         monkeypatch.setattr(constants, "ENDPOINT", endpoint)
         monkeypatch.setattr(constants, "HF_HUB_OFFLINE", not endpoint)

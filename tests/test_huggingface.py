@@ -19,6 +19,7 @@ from huggingface_hub import constants
 from saved_policies import change_json
 from tiny_encoder import LONGEST, numbers, sizes, write_encoder
 
+from vla.config.annotations import locate
 from vla.io.errors import UserError
 from vla.models.text.huggingface import HuggingFace
 
@@ -177,8 +178,8 @@ def test_without_folder_and_hub_the_name_is_named(name: str, monkeypatch: pytest
         HuggingFace(name, width=8)
 
 
-def test_without_transformers_the_extra_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("transformers", "transformers.utils"):
-        monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(UserError, match=r"needs transformers: install .*'\.\[hf\]'"):
-        HuggingFace(str(folder), width=8)
+def test_without_transformers_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    monkeypatch.delitem(sys.modules, HuggingFace.__module__)
+    with pytest.raises(UserError, match=r"transformers.* its extra hf: pip install -e '\.\[hf\]'"):
+        locate("model.text._target_", f"{HuggingFace.__module__}.HuggingFace")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
@@ -181,7 +180,7 @@ def test_the_experiment_draws_what_lerobots_images_show() -> None:
 
 def lerobots_picture(task: str, seed: int) -> Array:
     """Its picture (480, 480, 3) after one step, drawn as it does."""
-    classes = package.metaworld().ALL_V3_ENVIRONMENTS
+    classes = package.env_dict.ALL_V3_ENVIRONMENTS
     simulator = classes[task + package.VERSION](render_mode="rgb_array", camera_name="corner2")
     simulator._partially_observable, simulator._set_task_called = False, True
     simulator._freeze_rand_vec, simulator.seeded_rand_vec = False, True
@@ -287,15 +286,6 @@ def test_the_fast_renderer_draws_what_mujocos_does(parts: Parts) -> None:
 def test_unknown_tasks_cameras_and_windows_are_refused(override: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         world(*override.split()).reset(0)
-
-
-def test_without_the_package_a_sentence_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    package.metaworld.cache_clear()
-    monkeypatch.setitem(sys.modules, "metaworld", None)
-    with pytest.raises(ValueError, match=r"not installed .* pip install 'vla\[metaworld\]'"):
-        world()
-    monkeypatch.undo()
-    assert len(world().tasks) == 50
 
 
 def test_perturbed_demonstrations_are_clean_labels_in_equal_shares(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from conftest import make_tabletop
 from vla.config.compose import axes
 from vla.spec import Array
 from vla.tasks.tabletop.environment import Tabletop
-from vla.tasks.tabletop.randomize.blocks import Colours, Distractors, Masses, Placement, Shapes
+from vla.tasks.tabletop.randomize.blocks import Colours, Distractors, Masses, Placement, ShapeName, Shapes
 from vla.tasks.tabletop.randomize.robot import Latency
 from vla.tasks.world import Streams
 
@@ -103,7 +103,7 @@ def test_what_is_not_there_is_nowhere_to_be_seen(hard: Tabletop) -> None:
 
 def test_every_shape_stands_on_the_table_and_weighs_what_its_volume_says() -> None:
     environment = make_tabletop("task/randomize=none")
-    expected = {"cube": 8.0, "cylinder": 2 * np.pi, "tall": 8 * 1.25, "flat": 8 * 0.75}
+    expected: dict[ShapeName, float] = {"cube": 8.0, "cylinder": 2 * np.pi, "tall": 8 * 1.25, "flat": 8 * 0.75}
     with environment.blind():
         for name, volume in expected.items():
             environment.simulation.randomize = {"mass": Masses((2.0, 2.0)), "shape": Shapes([name])}
@@ -174,10 +174,6 @@ def test_streams_differ_between_axes_and_seeds() -> None:
 
 def test_bad_axes_are_explained(tabletop: Tabletop) -> None:
     compiled = tabletop.simulation.compiled
-    with pytest.raises(ValueError, match=r"unknown colours \['mauve'\]"):
-        Colours(["mauve"], jitter=0.0)
-    with pytest.raises(ValueError, match=r"unknown shapes \['ball'\]"):
-        Shapes(["ball"])
     with pytest.raises(ValueError, match="4 blocks need as many colours"):
         Colours(["red"], jitter=0.0)(compiled, np.random.RandomState(0))
     with pytest.raises(ValueError, match="no room"):

@@ -244,13 +244,17 @@ def test_the_encoding_is_documented() -> None:
         ("msgpack", "server", "vla.deploy.server.PolicyServer"),
         ("websockets", "server", "vla.rollouts.remote.RemotePolicy"),
         ("transformers", "vlm", "vla.models.vlm.smolvla.SmolVLA"),
+        ("onnxruntime", "onnx", "vla.deploy.onnx_policy.OnnxPolicy"),
+        ("onnxscript", "onnx", "vla.deploy.onnx_policy.OnnxPolicy"),
+        ("metaworld", "metaworld", "vla.tasks.metaworld.environment.MetaWorld"),
     ],
 )
 def test_what_is_missing_is_said_with_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch, library: str, extra: str, target: str
 ) -> None:
+    users = ("vla.io.array_messages", "vla.tasks.metaworld.package", target.rpartition(".")[0])
     for module in [*sys.modules]:
-        if module in ("vla.io.array_messages", target.rpartition(".")[0]) or module.startswith(f"{library}."):
+        if module in users or module.startswith(f"{library}."):
             monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(MissingLibrary, match=rf"{library}.* its extra {extra}: pip install -e '\.\[{extra}\]'"):

@@ -92,7 +92,6 @@ def test_an_episode_without_success_ends_at_the_time_limit_and_says_why(tabletop
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["task.cameras=[side]"], "'front', 'wrist'"),
         (["task.blocks=7"], r"task\.blocks must be from 2 to 6"),
         (["task.blocks=6", "task/goal=stay"], r"task\.blocks must be from 2 to 5"),
         # An impossible instruction names a colour that neither a block nor the held-out part has.

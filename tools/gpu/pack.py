@@ -13,7 +13,6 @@ import re
 import shutil
 import subprocess
 import sys
-import tarfile
 import zipfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -29,16 +28,8 @@ THERE = {
 }
 LEFT_OUT = {"av", "rerun-sdk"}
 PACKAGES = (
-    *(
-        "absl-py",
-        "annotated-types",
-        "antlr4-python3-runtime",
-        "cloudpickle",
-        "dm-env",
-        "dm-tree",
-        "dm_control",
-        "Farama-Notifications",
-    ),
+    *("absl-py", "annotated-types", "antlr4-python3-runtime", "cloudpickle", "dm-env", "dm-tree", "dm_control"),
+    "Farama-Notifications",
     *("fast-simplification", "glcontext", "glfw", "gymnasium", "gymnasium-robotics", "hydra-core", "loky", "moderngl"),
     *("mujoco", "omegaconf", "pydantic", "pydantic_core", "PyOpenGL", "typing-inspection"),
 )
@@ -72,29 +63,20 @@ def pack_site(target: Path, work: Path) -> None:
     """Write site.tar.xz: the packages, in the versions of constraints.txt."""
     pins = pinned(PACKAGES)
     source = [pin for pin in pins if pin.startswith("antlr4")]  # has no wheel
+    others = [pin for pin in pins if pin not in source]
     pip, wheels = [sys.executable, "-m", "pip"], work / "wheels"
     tags = [f"manylinux_2_{minor}_x86_64" for minor in GLIBC]
     tags += [f"manylinux{name}_x86_64" for name in ("2014", "2010", "1")]
     platforms = [part for tag in tags for part in ("--platform", tag)]
     abis = [part for abi in ("cp312", "abi3", "none") for part in ("--abi", abi)]
     python = ["--python-version", "3.12", "--implementation", "cp", "--only-binary=:all:", *abis]
-    run(
-        *pip,
-        "download",
-        "-q",
-        "--no-deps",
-        *python,
-        *platforms,
-        "-d",
-        wheels,
-        *(each for each in pins if each not in source),
-    )
+    run(*pip, "download", "-q", "--no-deps", *python, *platforms, "-d", wheels, *others)
     run(*pip, "wheel", "-q", "--no-deps", "-w", wheels, *source)
     for wheel in sorted(wheels.glob("*.whl")):
         unpack(wheel, work / "site")
     # vla looks for the folder of this package, and does not import it.
     (work / "site/gymnasium_robotics/__init__.py").write_text('"""Only the meshes of the arm."""\n')
-    compress(work / "site", target / "site.tar.xz")
+    compress(work / "site", target)
 
 
 def pinned(names: Iterable[str]) -> list[str]:
@@ -151,7 +133,7 @@ def pack_mesa(target: Path, work: Path) -> None:
     run("strip", "--strip-unneeded", *(mesa / "lib").glob("*.so*"), *(mesa / "dri").glob("*.so"))
     icd = {"file_format_version": "1.0.0", "ICD": {"library_path": "libEGL_mesa.so.0"}}
     (mesa / "vendor.json").write_text(json.dumps(icd))
-    compress(mesa, target / "mesa.tar.xz")
+    compress(mesa, target)
 
 
 def links(library: Path) -> Iterator[Path]:
@@ -175,11 +157,9 @@ def write_stub(user: Path, mark: str, target: Path, work: Path) -> None:
 
 
 def compress(folder: Path, target: Path) -> None:
-    """Write a folder as a compressed archive."""
-    draft = target.with_name(f".{target.name}")
-    with tarfile.open(draft, "w:xz", preset=6) as archive:
-        archive.add(folder, folder.name)
-    draft.replace(target)
+    """Write a folder as a compressed archive of its name into another folder."""
+    archive = shutil.make_archive(str(folder), "xztar", folder.parent, folder.name)
+    shutil.move(archive, target / Path(archive).name)
 
 
 def main() -> None:

@@ -27,10 +27,8 @@ from libero.libero.envs.env_wrapper import ControlEnv
 
 FIXTURE_SEED = 1  # initial states say nothing of fixtures, which every reset draws from NumPy's global generator
 KINDS = ("", "_swap", "_object", "_lan", "_task")
-SENTENCES = (
-    "_lan",
-    "_task",
-)  # of the problem, as LIBERO-PRO plays them; elsewhere, as published, those of the name of its file
+# With sentences of the problem, as LIBERO-PRO plays them; the others, as published, with those of the file's name.
+SENTENCES = ("_lan", "_task")
 SUITES = [f"libero_{suite}{kind}" for kind in KINDS for suite in ("spatial", "object", "goal", "10")]
 FOLDERS = {
     "@robosuite": Path(robosuite.__file__).parent,

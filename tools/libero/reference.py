@@ -77,10 +77,8 @@ def measured(task: Any, seed: int) -> dict[str, Any]:
 
 def main() -> None:
     """Measure all tasks of the suites."""
-    folder, suites = (
-        Path(sys.argv[1]),
-        sys.argv[2:] or [f"libero_{name}" for name in ("spatial", "object", "goal", "10")],
-    )
+    folder = Path(sys.argv[1])
+    suites = sys.argv[2:] or [f"libero_{name}" for name in ("spatial", "object", "goal", "10")]
     folder.mkdir(parents=True, exist_ok=True)
     for name in suites:
         with contextlib.redirect_stdout(io.StringIO()):

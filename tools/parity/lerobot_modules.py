@@ -17,16 +17,7 @@ from typing import Any
 
 # What LeRobot imports, and nothing compared here calls.
 LIBRARIES = (
-    "accelerate",
-    "av",
-    "cv2",
-    "datasets",
-    "deepdiff",
-    "einops",
-    "gymnasium",
-    "imageio",
-    "jsonlines",
-    "peft",
+    *("accelerate", "av", "cv2", "datasets", "deepdiff", "einops", "gymnasium", "imageio", "jsonlines", "peft"),
     "serial",
 )
 PARTS = ("lerobot.configs.train", "lerobot.datasets", "lerobot.envs", "lerobot.robots", "lerobot.teleoperators")
@@ -43,11 +34,7 @@ class Placeholder(type):
 
 class _Module(ModuleType):
     __path__: Sequence[str] = []
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return Placeholder(name, (), {})
+    __getattr__ = Placeholder.__getattr__
 
 
 class _Finder(MetaPathFinder, Loader):
@@ -61,6 +48,18 @@ class _Finder(MetaPathFinder, Loader):
 
     def exec_module(self, module: ModuleType) -> None:
         pass
+
+
+def processors_of(folder: Path) -> tuple[Any, ...]:
+    """Return LeRobot's processors before and after an exported policy."""
+    from lerobot.processor import PolicyProcessorPipeline
+    from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
+
+    after = {"to_transition": policy_action_to_transition, "to_output": transition_to_policy_action}
+    return tuple(
+        PolicyProcessorPipeline.from_pretrained(folder, config_filename=f"policy_{part}.json", **options)
+        for part, options in (("preprocessor", {}), ("postprocessor", after))
+    )
 
 
 def _prepare() -> None:

@@ -14,27 +14,17 @@ from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
-import lerobot_modules  # first: it makes the imports of LeRobot possible  # noqa: F401
+import lerobot_modules  # first: it makes the imports of LeRobot possible
 import newer_python  # noqa: F401
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.pi05 import modeling_pi05
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.pi05.processor_pi05 import make_pi05_pre_post_processors
-from lerobot.processor import PolicyProcessorPipeline, tokenizer_processor
-from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
+from lerobot.processor import tokenizer_processor
 from references import TOLERANCE, write
 from safetensors.torch import load_file
-from tiny_pi import (
-    CHUNK,
-    LENGTH,
-    SIZES,
-    STEPS,
-    TASKS,
-    inputs,
-    observed,
-    tokenizer,
-)
+from tiny_pi import CHUNK, LENGTH, SIZES, STEPS, TASKS, inputs, observed, tokenizer
 from tiny_vla import deviation, fill
 from torch import Tensor
 from transformers import GemmaConfig, PaliGemmaConfig, PreTrainedTokenizerFast
@@ -165,13 +155,7 @@ def exported_results(folder: Path) -> Tensor:
     # The former is the same matrix as that of the head, and no action depends on the latter.
     missing = {"paligemma.model.language_model.embed_tokens.weight", "gemma_expert.lm_head.weight"}
     assert state.keys() - written.keys() == {f"model.paligemma_with_expert.{name}" for name in missing}
-    before, after = (
-        PolicyProcessorPipeline.from_pretrained(folder / "exported", config_filename=f"policy_{part}.json", **options)
-        for part, options in (
-            ("preprocessor", {}),
-            ("postprocessor", {"to_transition": policy_action_to_transition, "to_output": transition_to_policy_action}),
-        )
-    )
+    before, after = lerobot_modules.processors_of(folder / "exported")
     return after(theirs.predict_action_chunk(before(raw()), noise=observed()["noise"]))
 
 

@@ -21,10 +21,7 @@ from tiny_vla import REFERENCE
 EMBEDDINGS = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
 SOURCE = "{name} of LeRobot 0.6.1 at its published sizes, without the embeddings of words; not its file itself. {known}"
 PUBLISHED = {  # class → repository, and what is known of its file
-    PI0Pytorch: (
-        "pi0_base",
-        "LeRobot's threads 2291 and 3109 quote names, 777 tensors, no embeddings.",
-    ),
+    PI0Pytorch: ("pi0_base", "LeRobot's threads 2291 and 3109 quote names, 777 tensors, no embeddings."),
     PI05Pytorch: ("pi05_base", "LeRobot's thread 2307 tells of the embeddings; a descendant has 812 tensors."),
 }
 

@@ -1,18 +1,18 @@
-"""What LeRobot's real-time chunking computes, to compare with: `python rtc.py ../../tests/rtc_reference.npz`.
+"""What LeRobot's real-time chunking computes, to compare with: the inputs, and for every case the guided velocity.
 
-Runs in an environment with torch and numpy, and with LeRobot (0.4.4) in PYTHONPATH, whose dependencies are not needed:
-`pip install --no-deps --target SITE lerobot==0.4.4`. Writes the inputs, and for every case the guided velocity.
+PYTHONPATH=.venv/parity/lerobot-0.4.4 python tools/parity/rtc.py tests/rtc_reference.npz
 """
 
 from __future__ import annotations
 
 import sys
-from importlib.util import find_spec
-from pathlib import Path
-from types import ModuleType
 
+import lerobot_modules  # first: it makes the imports of LeRobot possible  # noqa: F401
 import numpy as np
 import torch
+from lerobot.configs.types import RTCAttentionSchedule
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from torch import Tensor
 
 SEED, BATCH, CHUNK, COMPONENTS = 0, 2, 8, 3
@@ -24,24 +24,8 @@ CASES = [
 ]
 
 
-def without_imports() -> None:
-    """Let LeRobot's packages be imported without what their `__init__` imports."""
-    found = find_spec("lerobot")
-    assert found and found.submodule_search_locations, "LeRobot is not in PYTHONPATH"
-    root = Path(found.submodule_search_locations[0])
-    for name in ("", ".configs", ".policies", ".policies.rtc"):
-        module = ModuleType(f"lerobot{name}")
-        module.__path__ = [str(root.joinpath(*name.split(".")))]
-        sys.modules[module.__name__] = module
-
-
 def main(path: str) -> None:
     """Write the inputs and LeRobot's results."""
-    without_imports()
-    from lerobot.configs.types import RTCAttentionSchedule
-    from lerobot.policies.rtc.configuration_rtc import RTCConfig
-    from lerobot.policies.rtc.modeling_rtc import RTCProcessor
-
     random = torch.Generator().manual_seed(SEED)
     matrix = torch.randn(COMPONENTS, COMPONENTS, generator=random)
     noisy, previous = (torch.randn(BATCH, CHUNK, COMPONENTS, generator=random) for _ in range(2))

@@ -8,23 +8,19 @@ policy that was exported here; and what LeRobot's processors make of every input
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import lerobot_modules  # first: it makes the imports of LeRobot possible  # noqa: F401
+import lerobot_modules  # first: it makes the imports of LeRobot possible
 import torch
 from fake_batch import as_policy
 from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy, VLAFlowMatching
 from lerobot.policies.smolvla.processor_smolvla import make_smolvla_pre_post_processors  # registers its steps
-from lerobot.processor import PolicyProcessorPipeline
-from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
-from safetensors.torch import save_file
+from references import TOLERANCE, write
 from smolvla_peer import their_network, without_hub
 from tiny_vla import (
     CHUNK,
-    REFERENCE,
     SENTENCES,
     SMOLVLA,
     SPEC,
@@ -43,9 +39,10 @@ from transformers import SmolVLMConfig
 
 from vla.models.vlm.lerobot_export import LeRobotPolicyExporter
 from vla.models.vlm.smolvla import SmolVLA
+from vla.models.vlm.trunk import IMAGES
+from vla.spec import Observation
 
 assert make_smolvla_pre_post_processors
-TOLERANCE = 1e-5
 PLAYED = 7  # observations, of two chunks
 
 
@@ -116,22 +113,14 @@ def compare_policies(folder: Path) -> dict[str, Tensor]:
     theirs = SmolVLAPolicy.from_pretrained(folder / "exported", strict=False)
     weights = dict(theirs.model.named_parameters())
     assert all(torch.equal(weights[name], weight) for name, weight in published(model.network))
-    before, after = (
-        PolicyProcessorPipeline.from_pretrained(folder / "exported", config_filename=f"policy_{part}.json", **options)
-        for part, options in (
-            ("preprocessor", {}),
-            ("postprocessor", {"to_transition": policy_action_to_transition, "to_output": transition_to_policy_action}),
-        )
-    )
+    before, after = lerobot_modules.processors_of(folder / "exported")
     noise = torch.randn(1, CHUNK, SMOLVLA["action_width"], generator=torch.Generator().manual_seed(1))
     model.sample_noise = lambda random: noise
     executed, acted = [], []
     for number in range(PLAYED):
         seen = observation(number)
-        images = {
-            f"observation.images.{name}": torch.from_numpy(rgb).permute(2, 0, 1) / 255 for name, rgb in seen.rgb.items()
-        }
-        given = before({"observation.state": torch.from_numpy(seen.state), "task": seen.instruction, **images})
+        rows = {"observation.state": torch.from_numpy(seen.state), **raw_images(seen)}
+        given = before({**rows, "task": seen.instruction})
         executed.append(after(theirs.select_action(given, noise=noise))[0])
         acted.append(torch.from_numpy(ours.act(seen)))
     compare(f"{PLAYED} executed actions", torch.stack(acted), torch.stack(executed))
@@ -139,13 +128,15 @@ def compare_policies(folder: Path) -> dict[str, Tensor]:
     return results | compare_inputs(theirs, before, model)
 
 
+def raw_images(seen: Observation) -> dict[str, Tensor]:
+    """Return the images of an observation as LeRobot's processors take them."""
+    return {f"{IMAGES}{name}": torch.from_numpy(rgb).permute(2, 0, 1) / 255 for name, rgb in seen.rgb.items()}
+
+
 def compare_inputs(theirs: SmolVLAPolicy, before: Any, model: Any) -> dict[str, Tensor]:
     """Compare images, state, tokens and actions as the networks get them."""
     seen, known = observation(0), torch.from_numpy(steps(len(SPEC.action))[:CHUNK])
-    images = {
-        f"observation.images.{name}": torch.from_numpy(rgb).permute(2, 0, 1) / 255 for name, rgb in seen.rgb.items()
-    }
-    rows = {"observation.state": torch.from_numpy(seen.state), "action": known, **images}
+    rows = {"observation.state": torch.from_numpy(seen.state), "action": known, **raw_images(seen)}
     given = [before({**rows, "task": sentence}) for sentence in SENTENCES]
     prepared, masks = theirs.prepare_images(given[0])
     assert all(mask.all() for mask in masks)
@@ -176,9 +167,7 @@ def main() -> None:
     results = compare_networks()
     with TemporaryDirectory() as folder:
         results |= compare_policies(Path(folder))
-    REFERENCE.mkdir(exist_ok=True)
-    save_file({name: value.detach().contiguous() for name, value in results.items()}, REFERENCE / "smolvla.safetensors")
-    print(json.dumps({"written": str(REFERENCE / "smolvla.safetensors")}))
+    write("smolvla", results)
 
 
 if __name__ == "__main__":

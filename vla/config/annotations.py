@@ -142,7 +142,7 @@ def mismatch(key: str, value: Any, annotation: Any) -> str:
     path, part = max((_within(value, each["loc"]) for each in errors), key=lambda within: len(within[0]))
     reasons = dict.fromkeys(each["msg"] for each in errors if _within(value, each["loc"])[0] == path)
     words = [re.sub(r"^\w+ should (be )?| after validation.*", "", each).replace("None", "null") for each in reasons]
-    verb = "must" if words[0].startswith("have ") else "must be"
+    verb = "must" if words[0].startswith(("have ", "match ")) else "must be"
     sentence = f"{key}{path} {verb} {' or '.join(words)}, got {short(part)}"
     if isinstance(part, str) and any(each["type"] == "node" for each in errors):
         return f"{sentence}: an option is chosen with a slash, {f'{key}{path}'.replace('.', '/')}={part}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -44,10 +44,8 @@ def opened(folder: Path) -> Iterator[Any]:
     with bag_errors(folder):
         reader = make_reader(folder)
         reader.open()
-    try:
+    with closing(reader):
         yield reader
-    finally:
-        reader.close()
 
 
 def messages_of(

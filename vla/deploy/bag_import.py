@@ -21,7 +21,7 @@ from vla.deploy import messages
 from vla.deploy.bag import DESCRIPTION, bag_errors, messages_of, opened
 from vla.deploy.control_loop import REPEATED
 from vla.deploy.joint_limiter import JointLimits
-from vla.deploy.observer import HISTORY, Measured, Observer, age_of
+from vla.deploy.observer import HISTORY, OLDEST, Measured, Observer
 from vla.deploy.safety import State
 from vla.deploy.settings import Topics
 from vla.io.errors import UserError
@@ -153,11 +153,16 @@ class _Bag:
     def _see(self, camera: str, at: float, message: Any) -> None:
         if not hasattr(message, "format"):
             messages.image_from(message)  # compressed ones are decoded when they are needed
-        age = age_of((message.header.stamp.sec, message.header.stamp.nanosec), self._start + at)
-        self.inputs.append((at, _Picture(camera, at - age)))
+        self.inputs.append((at, _Picture(camera, self._taken(at, message))))
+
+    def _taken(self, at: float, message: Any) -> float:
+        """Return when a message that came at `at` was taken, by its time stamp unless that is of another clock."""
+        taken = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        age = self._start + at - taken
+        return at - age if taken and 0 <= age < OLDEST else at
 
     def _measure(self, at: float, message: Any) -> None:
-        taken = at - age_of((message.header.stamp.sec, message.header.stamp.nanosec), self._start + at)
+        taken = self._taken(at, message)
         if (measured := self._joint_states.read(message, taken)) is None:
             raise UserError("they hold the fingers alone")
         taken = max(taken, self.measured[-1][0]) if self.measured else taken

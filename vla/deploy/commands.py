@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from builtin_interfaces.msg import Duration
+from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -125,11 +125,9 @@ def trajectory(limits: JointLimits, commands: Sequence[Command], tick: float) ->
     """
     points = []
     for number, command in enumerate(commands, 1):
-        seconds, rest = divmod(number * tick, 1.0)
         velocities = command.velocity if number < len(commands) else 0 * command.velocity
-        due = Duration(sec=int(seconds), nanosec=int(rest * 1e9))
         point = {"positions": command.position.tolist(), "velocities": velocities.tolist()}
-        points.append(JointTrajectoryPoint(**point, time_from_start=due))
+        points.append(JointTrajectoryPoint(**point, time_from_start=Duration(seconds=number * tick).to_msg()))
     return JointTrajectory(joint_names=list(limits.joints), points=points)
 
 

@@ -65,7 +65,7 @@ class GuardedLifecycleNode(LifecycleNode):
             publisher: Any = self.create_lifecycle_publisher(kind, topic, 1)
             self.created.callback(self.destroy_lifecycle_publisher, publisher)
         else:
-            publisher = super(LifecycleNode, self).create_publisher(kind, topic, qos)
+            publisher = self.create_publisher(kind, topic, qos)
             self.created.callback(self.destroy_publisher, publisher)
         return publisher
 

@@ -172,7 +172,7 @@ class Motion:
         self._record(now)
         return _command(self.limiter, self._opening)
 
-    def horizon(self, now: float, longest: float = math.inf) -> list[Command]:
+    def horizon(self, now: float, longest: float) -> list[Command]:
         """Return the commands after this tick's if no further input arrives; the last one is at rest.
 
         Args:

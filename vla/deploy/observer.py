@@ -119,9 +119,3 @@ class Observer:
         values = dict(zip(self._model.joints, measured.joints, strict=True))
         values |= dict(zip(self._model.velocities, measured.velocities, strict=False))
         return np.array([values.get(name, measured.opening) for name in self._spec.state] / self._factors, np.float32)
-
-
-def age_of(stamp: tuple[int, int], now: float) -> float:
-    """Return the age [s] of a message by its time stamp; 0 if the stamp cannot come from the clock of `now` [s]."""
-    age = now - (stamp[0] + stamp[1] * 1e-9)
-    return age if stamp != (0, 0) and 0 <= age < OLDEST else 0.0

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import onnxruntime
+import onnxscript  # noqa: F401  # of `torch.onnx.export`
 import torch
 from filelock import FileLock
 from torch import Tensor, nn
@@ -60,8 +62,8 @@ class Program(nn.Module):
 
 
 class OnnxPolicy(Policy):
-    """A policy on the CPU that encodes frames and predicts actions with the ONNX programs of its model (UserError: ONNX
-    is not installed, or the model cannot be exported).
+    """A policy on the CPU that encodes frames and predicts actions with the ONNX programs of its model (UserError: the
+    model cannot be exported).
 
     The programs are exported once and kept in `folder`, below a digest of code, options and weights of the model:
     `act.onnx`, `encode.onnx` if the model caches tokens of past frames, and `program.json` with their inputs. They
@@ -70,7 +72,6 @@ class OnnxPolicy(Policy):
     """
 
     def __init__(self, folder: Text | Path, *, model: Model, spec: Spec) -> None:
-        _require_onnx()
         super().__init__("cpu", "fp32", compile=False, lanes=1, model=model, spec=spec)
         programs = Path(folder).resolve() / digest(model, spec)
         programs.parent.mkdir(parents=True, exist_ok=True)
@@ -147,14 +148,12 @@ def capture(program: Program, inputs: Inputs) -> ExportedProgram:
 
 def open_onnx(path: Path) -> Run:
     """Return a function that runs an ONNX program on the CPU; raise a UserError if the file is damaged."""
-    from onnxruntime import InferenceSession, SessionOptions
-
-    options = SessionOptions()
+    options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     # Else the idle threads of one program wait in a busy loop, and slow down the program that runs next.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     try:
-        session = InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # of its own kinds
         raise UserError(f"{path} is damaged: delete its folder, and export the policy again") from error
     used = {node.name for node in session.get_inputs()}  # without inputs that the program ignores
@@ -166,14 +165,6 @@ def open_onnx(path: Path) -> Run:
     return run
 
 
-def _require_onnx() -> None:
-    try:
-        import onnxruntime  # noqa: F401
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise UserError("ONNX is not installed: pip install 'vla[onnx]', or choose policy=default") from error
-
-
 def _difference(program: Run, exported: Run, steps: list[Inputs], span: Tensor | None) -> float:
     """Return the largest difference between two outputs, relative to `span` or else to the largest output."""
     with torch.inference_mode():
@@ -183,8 +174,6 @@ def _difference(program: Run, exported: Run, steps: list[Inputs], span: Tensor |
 
 def digest(model: Model, spec: Spec) -> str:
     """Return a digest of versions, code, options and weights, sixteen hexadecimal digits."""
-    import onnxruntime
-
     content = hashlib.sha256(f"{torch.__version__} {onnxruntime.__version__} {spec.to_dict()}".encode())
     kinds = {kind for module in model.modules() for kind in type(module).__mro__ if issubclass(kind, nn.Module)}
     for file in sorted({inspect.getfile(kind) for kind in kinds}):

@@ -13,13 +13,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
-from types import FrameType
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le
 
 from vla.io.errors import UserError
 from vla.io.printable import printable
+from vla.parallel.processes import stopped_by
 
 MAX_DOMAIN = 232  # larger domains have no UDP ports
 LOOPBACK = Path(__file__).with_name("loopback.xml")
@@ -91,24 +91,17 @@ def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
             "ROS 2 is not installed: install vla[ros] (Linux, x86-64), or source the setup.bash of a ROS 2 Jazzy for "
             f"this version of Python ({error})"
         ) from error
-    stopped = Event()
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        stopped.set()
-
     hangup = () if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (signal.SIGHUP,)  # ignored by nohup
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM, *hangup)}
-    try:
+    with stopped_by(signal.SIGINT, signal.SIGTERM, *hangup) as stopped:
         try:
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         except RuntimeError as error:
             given = shlex.join(arguments) or "its environment"
             raise UserError(f"ROS does not accept {given}: {str(error).splitlines()[0]}") from error
-        yield stopped
-    finally:
-        rclpy.try_shutdown()
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        try:
+            yield stopped
+        finally:
+            rclpy.try_shutdown()
 
 
 @contextmanager

@@ -22,7 +22,6 @@ from http import HTTPStatus
 from ipaddress import ip_address
 from itertools import count
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -35,6 +34,7 @@ from vla.deploy.client_observation import Keys, instruction
 from vla.io.array_messages import pack, unpack
 from vla.io.errors import UserError
 from vla.io.types import Count, Text
+from vla.parallel.processes import stopped_by
 from vla.spec import Array, Environment, Observation
 
 if TYPE_CHECKING:
@@ -89,18 +89,13 @@ class PolicyServer:
             raise UserError(
                 f"deploy=server serves a trained policy, checkpoint=RUN; a {type(policy).__name__} cannot be served"
             )
-        stop = Event()
-        before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            with Service(self, policy).in_thread() as url:
+            with stopped_by(signal.SIGINT, signal.SIGTERM) as stop, Service(self, policy).in_thread() as url:
                 log.info("serving the policy at %s", url)
                 stop.wait()
         except OSError as error:
             where = f"deploy.host={self.host} deploy.port={self.port}"
             raise UserError(f"cannot listen at {where}: {error.strerror}; deploy.port=0 is any free one") from error
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
 
 class Service:

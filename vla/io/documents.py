@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from functools import cache
 from math import isfinite
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast
 
 import yaml
-from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
+from pydantic import ConfigDict, PydanticUserError, StringConstraints, TypeAdapter, ValidationError
 
 from vla.io.errors import UserError
 from vla.io.files import require_file
@@ -30,6 +30,7 @@ MAX_DEPTH = 64  # nesting levels in YAML; pydantic's JSON parser stops at 200 by
 # keys, such as derived values, or those of other programs.
 STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 LENIENT = ConfigDict(STRICT, extra="ignore")
+SHA256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 
 
 def read_json(path: Path, kind: type[T], largest: int = MAX_BYTES) -> T:

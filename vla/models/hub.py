@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
-from http.client import HTTPException
 from pathlib import Path
-from urllib.error import HTTPError
-from urllib.request import urlopen
 
+from vla.io.documents import lines_of
 from vla.io.errors import UserError
 
 HUB = "hub:"  # before the name of a model
@@ -43,14 +40,13 @@ def fetch(name: str, *patterns: str, advice: str = "") -> Path:
 
 
 def _unreachable() -> str | None:
-    """Return why the hub is unreachable, or None; without this check a download retries for most of a minute."""
-    from huggingface_hub import constants
+    """Return why the hub is unreachable, or None; without this check a download waits without a limit of its own."""
+    from huggingface_hub import constants, get_session
 
     if constants.HF_HUB_OFFLINE:
         return "HF_HUB_OFFLINE is set"
     try:
-        with suppress(HTTPError):  # also a response
-            urlopen(constants.ENDPOINT, timeout=TIMEOUT).close()
-    except (OSError, ValueError, HTTPException) as error:  # also of an HF_ENDPOINT that is no address
-        return str(error)
+        get_session().head(constants.ENDPOINT, timeout=TIMEOUT)  # any status will do
+    except Exception as error:  # of several kinds, also of an HF_ENDPOINT that is no address
+        return lines_of(error)[0]
     return None

@@ -9,7 +9,8 @@ from dataclasses import asdict
 from typing import Any, Literal
 
 import torch
-from lightning import Callback, LightningModule, Trainer
+from lightning import Callback, LightningModule
+from lightning.pytorch.callbacks import LambdaCallback
 from torch import Tensor, distributed, nn
 from torchmetrics import MeanMetric
 
@@ -114,8 +115,8 @@ class Learner(LightningModule):
             self._before = None
 
     def configure_callbacks(self) -> list[Callback]:
-        """Return the callback that also undoes it after an error."""
-        return [_TearDown()]
+        """Return the callback that undoes it after an error, too: Lightning does not then, and a sweep goes on."""
+        return [LambdaCallback(on_exception=lambda *_: self.teardown("fit"))]
 
     @contextmanager
     def evaluating(self) -> Iterator[None]:
@@ -233,14 +234,6 @@ class Learner(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restore the figures of the last validation, for a policy that is saved before the next one."""
         self._figures = checkpoint["figures"]
-
-
-class _TearDown(Callback):
-    """Calls `teardown` where a training ends in an error, after which Lightning does not, but a sweep goes on."""
-
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Undo what the training set."""
-        pl_module.teardown("fit")
 
 
 def _set_precision(flash: bool, precision: str) -> None:

@@ -5,7 +5,7 @@ Shapes: r rank, I inputs and O outputs of a linear map.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
@@ -62,7 +62,10 @@ class LoRA:
                 module.activation_relu_or_gelu = 0  # else it would read the weights past the factors, in evaluation
 
     def _chosen(self, model: nn.Module) -> list[str]:
-        linear, chosen = list(_linear(model)), dict[str, None]()
+        modules, chosen = dict(model.named_modules()), dict[str, None]()
+        # Those of torch's attention are not called as modules, so factors beside them would do nothing.
+        attention = [name for name, module in modules.items() if isinstance(module, nn.MultiheadAttention)]
+        linear = [name for name in modules if isinstance(modules[name], nn.Linear) and not is_within(name, attention)]
         for pattern in self.modules:
             found = [name for name in linear if fnmatchcase(f".{name}.", f"*.{pattern}.*")]
             if not found:
@@ -74,15 +77,6 @@ class LoRA:
                 )
             chosen |= dict.fromkeys(found)
         return list(chosen)
-
-
-def _linear(model: nn.Module, prefix: str = "") -> Iterator[str]:
-    """Yield the names of the linear maps that are called as modules, unlike those of torch's attention."""
-    for name, module in model.named_children():
-        if isinstance(module, nn.Linear):
-            yield prefix + name
-        elif not isinstance(module, nn.MultiheadAttention):
-            yield from _linear(module, f"{prefix}{name}.")
 
 
 def without_lora(state: Mapping[str, Any], scale: float, named: Collection[str]) -> dict[str, Any]:

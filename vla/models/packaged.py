@@ -7,18 +7,11 @@ from base64 import urlsafe_b64encode
 from dataclasses import dataclass
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
-from typing import Annotated
 
-from annotated_types import Predicate
-
+from vla.io.documents import SHA256
 from vla.io.errors import UserError
 from vla.io.types import Text
 from vla.models.hub import fetch
-
-
-def is_digest(value: str) -> bool:
-    """64 hexadecimal digits"""
-    return len(value) == 64 and set(value) <= set("0123456789abcdef")
 
 
 @dataclass(frozen=True)
@@ -32,7 +25,7 @@ class PackagedFile:
     """
 
     source: Text
-    sha256: Annotated[str, Predicate(is_digest)]
+    sha256: SHA256
     hub: Text | None
 
     def locate(self, *patterns: str) -> Path:

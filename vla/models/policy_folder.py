@@ -11,13 +11,12 @@ import re
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from pydantic import StringConstraints
 from torch.overrides import TorchFunctionMode
 
-from vla.io.documents import STRICT, lines_of, parse_json, parse_plain, read_resolved
+from vla.io.documents import SHA256, STRICT, lines_of, parse_json, parse_plain, read_resolved
 from vla.io.errors import UserError
 from vla.io.types import Natural, Seed
 from vla.models.hub import HUB, fetch
@@ -50,7 +49,7 @@ class Training:
     windows: str  # digest of the demonstrations, empty if unknown
     seed: int | None
     validation: tuple[Seed, Natural] | None  # first seed and number of the episodes that select among weights
-    weights: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]  # SHA-256 of their file
+    weights: SHA256  # of their file
     versions: dict[str, str]  # library → version
     figures: dict[str, float]  # of the last validation
     trunks: dict[str, Source] = field(default_factory=dict)  # part → where its weights are, which the file lacks

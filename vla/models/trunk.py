@@ -6,12 +6,11 @@ import hashlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import StringConstraints
 from torch import nn
 
-from vla.io.documents import STRICT
+from vla.io.documents import SHA256, STRICT
 from vla.io.errors import UserError
 from vla.io.types import Natural, Text
 
@@ -24,7 +23,7 @@ class Source:
 
     name: Text  # package, file or folder, or repository of the hub
     revision: str | None  # commit of the hub
-    sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]  # of the file
+    sha256: SHA256  # of the file
     size: Natural  # of the file [bytes]
 
     @classmethod

@@ -169,6 +169,18 @@ def spin_briefly() -> None:
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # about ten microseconds
 
 
+@contextmanager
+def stopped_by(*signals: signal.Signals) -> Iterator[threading.Event]:
+    """Yield an event that these signals set within the context."""
+    stopped = threading.Event()
+    before = {number: signal.signal(number, lambda *_: stopped.set()) for number in signals}
+    try:
+        yield stopped
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def without_triton() -> None:
     """Block the import of Triton where PyTorch cannot use it, on machines without a GPU.
 

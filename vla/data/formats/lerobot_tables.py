@@ -6,8 +6,7 @@ Shapes: N steps, D components.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -162,21 +161,16 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
     pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), path, write_page_checksum=True)
 
 
-def write_rows(path: Path, episodes: Iterable[Mapping[str, Array]]) -> None:
+def write_rows(path: Path, episodes: Sequence[Mapping[str, Array]]) -> None:
     """Write columns, each (N,) or (N, D), with a row group per episode.
 
     The schema metadata has the types that the package `datasets` needs.
     """
-    with ExitStack() as opened:
-        writer: pq.ParquetWriter | None = None
-        for columns in episodes:
-            features = {name: _feature(values) for name, values in columns.items()}
-            metadata = {"huggingface": json.dumps({"info": {"features": features}})}
-            table = pa.table({name: _arrow(values) for name, values in columns.items()})
-            table = table.replace_schema_metadata(metadata)
-            if writer is None:
-                writer = pq.ParquetWriter(path, table.schema, compression="zstd", write_page_checksum=True)
-                opened.enter_context(writer)
+    features = {name: _feature(values) for name, values in episodes[0].items()}
+    metadata = {"huggingface": json.dumps({"info": {"features": features}})}
+    tables = [pa.table({name: _arrow(values) for name, values in each.items()}, metadata=metadata) for each in episodes]
+    with pq.ParquetWriter(path, tables[0].schema, compression="zstd", write_page_checksum=True) as writer:
+        for table in tables:
             writer.write_table(table)
 
 

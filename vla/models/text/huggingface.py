@@ -15,6 +15,7 @@ from typing import Any
 from zipfile import ZipFile
 
 import torch
+import transformers
 from torch import Tensor, nn
 
 from vla.io.documents import lines_of, mappings, read_json
@@ -100,20 +101,13 @@ class HuggingFace(TextEncoder):
         width: length of the sentence vector.
 
     Raises:
-        UserError: transformers is not installed, the folder, model or package does not exist, or it is not an encoder.
+        UserError: the folder, model or package does not exist, or it is not an encoder.
     """
 
     def __init__(self, name: str | PackagedFile, *, width: int) -> None:
         super().__init__(width)
-        try:
-            from transformers.utils import logging as transformers_logging
-        except ImportError as error:
-            raise UserError(
-                "a text encoder of Hugging Face needs transformers: install this package with its extra hf, as in "
-                "pip install -e '.[hf]'"
-            ) from error
-        transformers_logging.set_verbosity_error()
-        transformers_logging.disable_progress_bar()
+        transformers.logging.set_verbosity_error()
+        transformers.logging.disable_progress_bar()
         self._name = name.source if isinstance(name, PackagedFile) else name
         with _folder(name) as folder:
             self.encoder = SentenceEncoder(folder)
@@ -168,8 +162,6 @@ def _folder(name: str | PackagedFile) -> Iterator[Path]:
 
 def _network(folder: Path) -> tuple[Any, str | None]:
     """Return the text encoder in a folder, and the name of its output that is a trained sentence vector, if any."""
-    import transformers
-
     values = read_json(folder / "config.json", dict[str, Any])
     if (folder / ADAPTER).exists():
         raise UserError(f"it has an adapter, {ADAPTER}: merge that into its weights")
@@ -190,9 +182,7 @@ def _network(folder: Path) -> tuple[Any, str | None]:
 
 def _tokenizer(folder: Path, config: Any) -> Any:
     """Return the tokenizer in a folder, which cuts texts to the limit of the network."""
-    from transformers import PreTrainedTokenizerFast
-
-    tokenizer = PreTrainedTokenizerFast.from_pretrained(folder)
+    tokenizer = transformers.PreTrainedTokenizerFast.from_pretrained(folder)
     length = min(tokenizer.model_max_length, getattr(config, "max_position_embeddings", tokenizer.model_max_length))
     backend = tokenizer.backend_tokenizer
     backend.no_padding()

@@ -153,7 +153,7 @@ class Fast(ActionTokenizer):
 
         Less than full precision would change some.
         """
-        inside = torch.minimum(torch.maximum(actions, self.low), self.high)
+        inside = actions.clamp(self.low, self.high)
         return (exact_product(self.basis, (inside - self.centre) / self.spread) * self.scale).round()
 
     def _texts(self, coefficients: Tensor) -> list[str]:

@@ -43,7 +43,7 @@ class Quantile(PerComponent):
 
     def encode(self, action: Tensor) -> Tensor:
         """Encode (…, D) float actions as their bins, (…, D) int64."""
-        inside = torch.minimum(torch.maximum(action, self.low), self.high)
+        inside = action.clamp(self.low, self.high)
         columns = inside.reshape(-1, self.components).T.contiguous()  # (D, N)
         return torch.searchsorted(self.edges, columns, right=True).T.reshape(action.shape)
 

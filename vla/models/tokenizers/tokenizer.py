@@ -154,7 +154,7 @@ class EvenBins(PerComponent):
 
     def _position(self, action: Tensor) -> Tensor:
         """Return the fractional token, 0 … K - 1, of (…, D) actions clipped to the bounds."""
-        inside = torch.minimum(torch.maximum(action, self.low), self.high)
+        inside = action.clamp(self.low, self.high)
         return (inside - self.low) / (self.high - self.low) * (self.bins - 1)
 
 

@@ -205,12 +205,9 @@ def _read(path: Path, name: str) -> dict[str, Tensor]:
     the tensors stand in the same order. If their shapes disagree, timm refuses them.
     """
     import timm
-    from safetensors.torch import load_file
 
     try:
-        if path.suffix == ".safetensors":
-            return load_file(path)
-        weights: dict[str, Tensor] = dict(torch.load(path, map_location="cpu", weights_only=True))
+        weights: dict[str, Tensor] = timm.models.load_state_dict(str(path), use_ema=False, weights_only=True)
         if not weights or not all(isinstance(each, Tensor) for each in weights.values()):
             raise ValueError
     except Exception as error:  # a pickle can raise nearly anything

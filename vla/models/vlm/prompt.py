@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tokenizers import Tokenizer
 from torch import Tensor
 
 from vla.io.documents import lines_of, read_bounded
@@ -113,10 +114,8 @@ def _padded(rows: list[list[int]], length: int) -> Tensor:
     return torch.tensor([row + [PADDING] * (length - len(row)) for row in rows])
 
 
-def _tokenizer(name: str) -> tuple[Any, str]:
+def _tokenizer(name: str) -> tuple[Tokenizer, str]:
     """Return the tokenizer in a folder or on the hub, and the SHA-256 of its file."""
-    from tokenizers import Tokenizer
-
     advice = f"nor is it a folder here: give model.text.name one with its {FILE}"
     path = (Path(name) if Path(name).is_dir() else fetch(name, FILE, advice=advice)) / FILE
     try:

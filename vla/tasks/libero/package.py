@@ -21,6 +21,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from vla.io.documents import LENIENT, parse_plain
 from vla.io.errors import UserError
 from vla.spec import Array
 
@@ -41,6 +42,8 @@ ALL = (*SUITES, *(f"{suite}_{change}" for change in CHANGES for suite in SUITES)
 @dataclass(frozen=True)
 class Task:
     """One task of a suite."""
+
+    __pydantic_config__ = LENIENT
 
     suite: str
     number: int  # in its suite, 0…9
@@ -112,21 +115,8 @@ def tasks_of(suite: str) -> tuple[Task, ...]:
     entries = known[f"libero_{'10' if kind == 'long' else kind}{'_' + change if change else ''}"]
     if missing := [number for number, entry in enumerate(entries) if "scene" not in entry]:
         raise UserError(f"the wheels lack what tasks {missing} of {suite} are made of: name others in task.tasks")
-    return tuple(_task(suite, number, entry) for number, entry in enumerate(entries))
-
-
-def _task(suite: str, number: int, entry: Mapping[str, Any]) -> Task:
-    return Task(
-        suite=suite,
-        number=number,
-        scene=entry["scene"],
-        instruction=entry["instruction"],
-        goal=tuple(map(tuple, entry["goal"])),
-        initial=tuple(map(tuple, entry["initial"])),
-        regions=entry["regions"],
-        fixtures=entry["fixtures"],
-        states=entry["states"],
-    )
+    numbered = [{**entry, "suite": suite, "number": number} for number, entry in enumerate(entries)]
+    return parse_plain(numbered, tuple[Task, ...], str(SCENES))
 
 
 def scene_xml(name: str) -> str:

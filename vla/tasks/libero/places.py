@@ -176,7 +176,7 @@ class _Form:
         self,
         spot: Array,
         rest: Array,
-        costs: Array | float = 0.0,
+        costs: Array | float,
         over: Array | None = None,
         margin: float = 2 * MARGIN,
         most: float = SLIT,

@@ -74,7 +74,7 @@ class MetaWorld(ManyTasks):
             steps: largest number of steps of an episode.
 
         Raises:
-            UserError: `metaworld` is not installed, or a task is unknown or has no sentence.
+            UserError: a task is unknown or has no sentence.
         """
         super().__init__()
         known = self._known = tasks_of("mt50")  # the truth names a task by its place here

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from metaworld.policies import ENV_POLICY_MAP
 
 from vla.io.errors import UserError
 from vla.spec import Array, Observation, Spec
 from vla.tasks.metaworld.environment import STATE, action_of
-from vla.tasks.metaworld.package import expert, tasks_of
+from vla.tasks.metaworld.package import VERSION, tasks_of
 
 
 class Scripted:
@@ -35,5 +36,5 @@ class Scripted:
         if observation.truth is None:
             raise UserError("expert=metaworld needs the simulator's truth, which this observation lacks")
         if self._expert is None:
-            self._expert = expert(self._names[int(observation.truth["task"][0])])
+            self._expert = ENV_POLICY_MAP[self._names[int(observation.truth["task"][0])] + VERSION]()
         return action_of(np.asarray(self._expert.get_action(observation.truth["observation"])))

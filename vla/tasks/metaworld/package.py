@@ -6,13 +6,11 @@ Task names are those of the package without their version: "push-back" is `push-
 from __future__ import annotations
 
 import warnings
-from functools import cache
-from types import ModuleType
 from typing import Any
 
 import mujoco
-
-from vla.io.errors import UserError
+from metaworld import env_dict
+from metaworld.sawyer_xyz_env import SawyerMocapBase
 
 VERSION = "-v3"
 # Where a weld holds a body: anchor (3), relative position (3) and quaternion (4), torque scale. A current MuJoCo has a
@@ -20,24 +18,13 @@ VERSION = "-v3"
 WELD = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 5.0)
 
 
-@cache
-def metaworld() -> ModuleType:
-    """Import the package and make its simulator construct models with this MuJoCo (UserError: it is not installed)."""
-    try:
-        from metaworld import env_dict, sawyer_xyz_env
-    except ImportError as error:
-        raise UserError(
-            f"task=metaworld needs the package metaworld, which is not installed ({error}): "
-            "pip install 'vla[metaworld]'"
-        ) from error
-    sawyer_xyz_env.SawyerMocapBase.reset_mocap_welds = _reset_welds
-    warnings.filterwarnings("ignore", r"Constant\(s\) may be too high", module=r"metaworld\.policies")  # clipped here
-    return env_dict
-
-
 def _reset_welds(simulator: Any) -> None:
     model = simulator.model
     model.eq_data[model.eq_type == mujoco.mjtEq.mjEQ_WELD, : len(WELD)] = WELD
+
+
+SawyerMocapBase.reset_mocap_welds = _reset_welds
+warnings.filterwarnings("ignore", r"Constant\(s\) may be too high", module=r"metaworld\.policies")  # clipped here
 
 
 def tasks_of(benchmark: str) -> tuple[str, ...]:
@@ -47,12 +34,12 @@ def tasks_of(benchmark: str) -> tuple[str, ...]:
     """
     if benchmark == "mt1":
         return ("reach",)
-    return tuple(name.removesuffix(VERSION) for name in getattr(metaworld(), f"{benchmark.upper()}_V3"))
+    return tuple(name.removesuffix(VERSION) for name in getattr(env_dict, f"{benchmark.upper()}_V3"))
 
 
 def simulator(task: str) -> Any:
     """Make the simulator of a task, whose resets draw object and goal from the generator that `seed` sets."""
-    made = metaworld().ALL_V3_ENVIRONMENTS[task + VERSION]()
+    made = env_dict.ALL_V3_ENVIRONMENTS[task + VERSION]()
     # What `set_task` of the benchmark MT1 does, but for freezing one place of object and goal.
     made._partially_observable = False  # the goal is part of the observation, which only the expert sees
     made.__dict__.pop("sawyer_observation_space", None)  # cached, and depends on it
@@ -73,11 +60,3 @@ def stop_sliding(simulator: Any) -> None:
     for name in ("obj_slidex", "obj_slidey"):
         if (joint := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)) >= 0:
             data.qvel[model.jnt_dofadr[joint]] = 0.0
-
-
-def expert(task: str) -> Any:
-    """Make the scripted expert of a task."""
-    metaworld()
-    from metaworld.policies import ENV_POLICY_MAP
-
-    return ENV_POLICY_MAP[task + VERSION]()

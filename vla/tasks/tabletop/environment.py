@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 
 import mujoco
 import numpy as np
-from annotated_types import Le
+from annotated_types import Le, MinLen, Predicate
 
 from vla.io.errors import UserError
-from vla.io.types import Count, ImageSize, Names, Point, Positive
+from vla.io.types import Count, ImageSize, Point, Positive, unique
 from vla.spec import FIRST_SEED, Array, Observation, Shape, Spec
 from vla.tasks.gl import require_backend
 from vla.tasks.rendering.renderer import LazyRenderer, RendererFactory, Views
@@ -55,7 +55,7 @@ class Tabletop(World):
         renderer: RendererFactory,
         blocks: Count,
         image_size: ImageSize,
-        cameras: Names,
+        cameras: Annotated[tuple[Literal["front", "wrist"], ...], MinLen(1), Predicate(unique)],
         time_limit: Annotated[Positive, Le(3600)],
         meshes: Literal["light", "full"],
         shadows: bool,
@@ -69,15 +69,13 @@ class Tabletop(World):
             renderer: renderer of the images.
             blocks: maximum number of blocks on the table; the axis `distractors` draws the number.
             image_size: height and width of every camera's images [px].
-            cameras: "front", "wrist" or both.
             time_limit: maximum time for an instruction, per block to be moved [s].
             meshes: robot meshes with few faces ("light") or all of them ("full", much slower on a CPU).
             shadows: whether the lamp casts shadows.
             robot: an arm from a file; None: the Panda.
 
         Raises:
-            UserError: an unknown camera, more blocks than colours, a robot that does not work, or a machine that cannot
-                render.
+            UserError: more blocks than colours, a robot that does not work, or a machine that cannot render.
         """
         super().__init__()
         require_backend()
@@ -85,8 +83,6 @@ class Tabletop(World):
         if not goal.blocks <= blocks <= most:
             raise UserError(f"task.blocks must be from {goal.blocks} to {most}, one colour each, got {blocks}")
         scene = CompiledScene(FileRobot(robot, meshes) if robot else Panda(meshes), blocks, shadows)
-        if unknown := sorted(set(cameras) - set(scene.cameras)):
-            raise UserError(f"unknown cameras {unknown}; task.cameras may list {sorted(scene.cameras)}")
         arm, joints = scene.robot.arm, len(scene.joints)
         motion = (TRANSLATION,) * 3 + (ROTATION,) * 3
         self.spec = Spec(

@@ -12,6 +12,7 @@ import numpy as np
 from annotated_types import MaxLen, MinLen
 
 from vla.io.errors import UserError
+from vla.tasks.tabletop.scene import ColourName
 
 Phrasings = Annotated[Sequence[Annotated[str, MaxLen(300)]], MinLen(1)]
 Words = Annotated[Sequence[Annotated[str, MinLen(1), MaxLen(60)]], MinLen(1)]
@@ -31,7 +32,7 @@ class Grammar:
     words: Mapping[str, Words]  # slot → synonyms
     held_out_phrasings: Phrasings
     held_out_words: Mapping[str, Words]  # slot → synonyms
-    held_out_colours: Sequence[str]
+    held_out_colours: Sequence[ColourName]
 
     def __post_init__(self) -> None:
         words, held_out = self.words, self.held_out_words

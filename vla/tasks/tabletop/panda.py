@@ -13,7 +13,6 @@ from dm_control import mjcf
 from vla.robots import panda
 from vla.spec import Array, RobotModel
 from vla.tasks.tabletop.robot import (
-    CORNERS,
     FINGERTIP_CONTACT,
     HIDDEN,
     ROBOT_CONTACT,
@@ -149,7 +148,7 @@ def _assets(meshes: str) -> str:
     for name in (*(f"link{index}" for index in range(8)), "hand", "finger"):
         file = folder / "collision" / f"{name}.stl"
         # Convex hulls of the collision meshes; with shadows, every face is rendered twice per camera.
-        light = attributes(vertex=spread(read_corners(file), CORNERS)) if meshes == "light" else ""
+        light = attributes(vertex=spread(read_corners(file))) if meshes == "light" else ""
         text += f'<mesh name="{name}" file="{file}"/>'
         text += f'<mesh name="{name}_seen" {light or attributes(file=str(folder / "visual" / f"{name}.stl"))}/>'
     return text

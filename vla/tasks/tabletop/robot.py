@@ -56,11 +56,11 @@ def look_at(position: Sequence[float] | Array, target: Sequence[float] | Array, 
     return np.stack([right, np.cross(back, right), back], axis=1)
 
 
-def spread(points: Array, count: int) -> Array:
-    """Select at most `count` of the (N, 3) points by farthest-point sampling."""
+def spread(points: Array) -> Array:
+    """Select at most `CORNERS` of the (N, 3) points by farthest-point sampling."""
     chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
     nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < min(count, len(points)):
+    while len(chosen) < min(CORNERS, len(points)):
         chosen.append(int(nearest.argmax()))
         nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return points[chosen]

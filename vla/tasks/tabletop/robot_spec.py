@@ -13,7 +13,7 @@ from vla.io.types import Names
 from vla.robots.cartesian import DOWN
 from vla.spec import Array
 from vla.tasks.rendering.shapes import mesh_triangles
-from vla.tasks.tabletop.robot import CORNERS, HIDDEN, ROBOT_CONTACT, VISIBLE, look_at, spread
+from vla.tasks.tabletop.robot import HIDDEN, ROBOT_CONTACT, VISIBLE, look_at, spread
 from vla.tasks.tabletop.robot_file import compiled, require
 
 TOOL, SERVO, WRIST = "vla_tool", "vla_servo_", "wrist"  # names of what is added
@@ -256,7 +256,7 @@ def add_hull(spec: mujoco.MjSpec, name: str, points: Array) -> bool:
     if np.linalg.matrix_rank(points - points.mean(0), tol=1e-3) < 3:
         return False
     # A scale that the file gives to its own meshes by default must not apply.
-    spec.add_mesh(name=name, uservert=spread(points, CORNERS).ravel(), scale=np.ones(3))
+    spec.add_mesh(name=name, uservert=spread(points).ravel(), scale=np.ones(3))
     return True
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from typing import Literal
 from xml.etree import ElementTree
 
 import mujoco
@@ -11,6 +12,7 @@ from dm_control import mjcf
 from vla.tasks.tabletop.robot import PHYSICS, VISIBLE, TabletopRobot, attributes, camera
 from vla.tasks.tabletop.robot_file import compiled
 
+ColourName = Literal["red", "green", "blue", "yellow", "purple", "orange"]
 COLOURS: dict[str, tuple[float, float, float]] = {
     "red": (0.85, 0.10, 0.10),
     "green": (0.10, 0.65, 0.20),

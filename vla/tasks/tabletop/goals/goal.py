@@ -14,7 +14,6 @@ from vla.io.errors import UserError
 from vla.io.types import Count
 from vla.spec import Array
 from vla.tasks.tabletop.language import Grammar
-from vla.tasks.tabletop.scene import COLOURS
 
 AT_REST = 0.02  # speed below which a block is at rest [m/s]
 
@@ -126,8 +125,6 @@ class Goal(ABC):
             raise UserError(f"task.goal.language has the slots {unknown}, but {type(self).__name__} fills {known}")
         if taken := sorted(SLOTS & {*language.words, *language.held_out_words}):
             raise UserError(f"task.goal.language has words for {', '.join(taken)}, slots that goals fill: rename them")
-        if strange := sorted(set(language.held_out_colours) - set(COLOURS)):
-            raise UserError(f"task.goal.language.held_out_colours has {strange}, the colours are {', '.join(COLOURS)}")
         self.language, self.hold_steps = language, hold_steps
 
     @property

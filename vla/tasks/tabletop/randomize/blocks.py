@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import dist
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from annotated_types import Ge, Le, MinLen, Predicate
@@ -14,12 +14,13 @@ from vla.io.errors import UserError
 from vla.io.types import CountRange, NonNegative, PositiveRange, Share, ascending, unique
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.randomize.randomizer import Angles, Places, rounded
-from vla.tasks.tabletop.scene import COLOURS, PAD_RADIUS, PADS
+from vla.tasks.tabletop.scene import COLOURS, PAD_RADIUS, PADS, ColourName
 
+ShapeName = Literal["cube", "cylinder", "tall", "flat"]
 SHAPES = {"cube": 1.0, "cylinder": 1.0, "tall": 1.25, "flat": 0.75}  # name → height over width
 HalfSize = Annotated[float, Ge(0.005), Le(0.034)]  # the Panda grasps it, the default clearance suffices [m]
 HalfSizes = Annotated[tuple[HalfSize, HalfSize], Predicate(ascending)]
-ColourNames = Annotated[Sequence[str], MinLen(1), Predicate(unique)]
+ColourNames = Annotated[Sequence[ColourName], MinLen(1), Predicate(unique)]
 ROOM = 0.034  # radius reserved for a block: half the diagonal of the largest one of the default sizes [m]
 
 
@@ -45,11 +46,6 @@ class Colours:
 
     names: ColourNames  # to draw from without replacement
     jitter: Share  # maximum change of each channel, 0…1
-
-    def __post_init__(self) -> None:
-        """Raise a UserError if a colour is unknown."""
-        if unknown := sorted(set(self.names) - set(COLOURS)):
-            raise UserError(f"unknown colours {unknown}, expected some of {sorted(COLOURS)}")
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw names and tints."""
@@ -81,12 +77,7 @@ class Sizes:
 class Shapes:
     """Shape of each block, applied after the size."""
 
-    names: Annotated[Sequence[str], MinLen(1)]  # to draw from
-
-    def __post_init__(self) -> None:
-        """Raise a UserError if a shape is unknown."""
-        if unknown := sorted(set(self.names) - set(SHAPES)):
-            raise UserError(f"unknown shapes {unknown}, expected some of {sorted(SHAPES)}")
+    names: Annotated[Sequence[ShapeName], MinLen(1)]  # to draw from
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw a shape per block."""
