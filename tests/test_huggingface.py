@@ -181,5 +181,5 @@ def test_without_folder_and_hub_the_name_is_named(name: str, monkeypatch: pytest
 def test_without_transformers_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "transformers", None)
     monkeypatch.delitem(sys.modules, HuggingFace.__module__)
-    with pytest.raises(UserError, match=r"transformers.* its extra hf: pip install -e '\.\[hf\]'"):
+    with pytest.raises(UserError, match=r"transformers.* its extra vlm: pip install -e '\.\[vlm\]'"):
         locate("model.text._target_", f"{HuggingFace.__module__}.HuggingFace")

@@ -79,7 +79,7 @@ def test_the_main_job_collects_trains_evaluates_and_records(home: Path) -> None:
     assert sorted(report["recorded"]) == sorted(report["seeds"])  # both failures, or successes of at most ten
     assert yaml.safe_load((home / "run/config.yaml").read_text()) == report["config"]
     printed = (home / "printed.txt").read_text()
-    assert "\ntraining  " in printed and "Epoch" not in printed
+    assert "\ntraining ━" in printed and "Epoch" not in printed
     last = printed.strip().splitlines()[-1]
     assert last.startswith(f"success {report['successes']}/2 (")
 
