@@ -199,7 +199,7 @@ def test_the_whole_loop_reports_and_its_bag_is_learned_from(home: Path, start: C
     loop = start("vla.run", "job=deploy", "deploy=loop", CHECKPOINT, limit, "deploy.episodes=2", "output=loop")
     printed = loop.printed(100)
     assert loop.wait() == 0, printed
-    assert "/2 (" in printed.strip().splitlines()[-1] and "wrote loop/report.json, report.png" in printed
+    assert "/2 (" in printed.strip().splitlines()[-1] and "wrote loop/report.html, report.json, report.png" in printed
     report = json.loads((home / "loop/report.json").read_text())
     assert report["seeds"] == [1_000_000, 1_000_001] and report["checkpoint"] == CHECKPOINT.partition("=")[2]
     # As simulated, whatever the clock says.

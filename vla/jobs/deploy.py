@@ -12,6 +12,7 @@ from vla.io.errors import UserError
 from vla.io.printable import printable
 from vla.models.policy_folder import require_unseen
 from vla.reports.evaluation import plot_report, write_report
+from vla.reports.run_page import write_page
 from vla.runs.folder import PLOT, REPORT, described
 from vla.spec import FIRST_SEED
 
@@ -38,7 +39,7 @@ def run(experiment: Experiment) -> None:
         output = experiment.output
         write_report(report, output / REPORT, experiment.settings.checkpoint, experiment.config)
         plot_report(report, output / PLOT)
-        log.info("wrote %s", described([output / REPORT, output / PLOT]))
+        log.info("wrote %s", described([write_page(output), output / REPORT, output / PLOT]))
         print(printable(str(report)))
         if report.errors:
             raise UserError(f"the episodes ended with an error, see {output / REPORT}: {report.errors[0].error}")
