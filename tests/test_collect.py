@@ -135,7 +135,7 @@ def test_shares_depend_neither_on_workers_nor_on_interruptions(tmp_path: Path) -
 
 def test_killed_at_random_moments_it_loses_and_doubles_nothing(tmp_path: Path, larger: Path) -> None:
     folder, random = tmp_path / "episodes", np.random.default_rng(0)
-    for kill in range(4):
+    for kill in range(5):
         before = lines(folder)
         # Every other one while it starts, or just after, the rest between two commits or within one.
         process = start(folder, before + kill % 2, workers=2 if kill < 2 else 1, episodes=2 * EPISODES)
@@ -151,7 +151,7 @@ def test_killed_at_random_moments_it_loses_and_doubles_nothing(tmp_path: Path, l
     assert content(folder) == content(larger)
 
 
-@pytest.mark.parametrize("pause", [None, 0.1])
+@pytest.mark.parametrize("pause", [None, 0.0, 0.3])
 def test_ctrl_c_ends_it_with_one_traceback_and_twice_too(tmp_path: Path, larger: Path, pause: float | None) -> None:
     folder = tmp_path / "episodes"
     process = start(folder, 3, episodes=10 * EPISODES)

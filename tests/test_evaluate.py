@@ -173,9 +173,10 @@ def test_what_no_report_can_hold_is_an_error_of_its_episode(tmp_path: Path) -> N
     write_report(report, tmp_path / "report.json", None, {})
 
 
-def test_of_those_side_by_side_only_the_episode_that_kills_its_process_is_an_error() -> None:
+@pytest.mark.parametrize("lanes", [1, 2])
+def test_only_the_episode_that_kills_its_process_is_an_error_also_of_those_side_by_side(lanes: int) -> None:
     makers, kept = (toy.make_deadly_environment, toy.make_agent, None), list[Result]()
-    report = evaluate(*makers, SEEDS, Cluster(2, "beside"), lanes=2, keep=kept.append)
+    report = evaluate(*makers, SEEDS, Cluster(2, "beside"), lanes=lanes, keep=kept.append)
     assert [error.seed for error in report.errors] == [toy.DEADLY_SEED]
     assert report.errors[0].error == (
         "a worker process crashed twice: it ended with exit status 1; cluster.workers=1 shows the traceback"

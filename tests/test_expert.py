@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 QUIET = {"start": 0.0, "noise": 0.0, "rate": 0.0, "unturned": 0.0, "missed": 0.0}
-# Goal → of so many episodes so many succeed, three standard deviations below the shares of 48 that did: 36 pushes, 41
-# stacks, at least 44 of each other goal. Which ones do differs between processors, whose physics round differently.
-RECOVERED = {"push": (24, 12), "stack": (24, 15), "pick_place": (24, 18)}
-GOALS = (*RECOVERED, "lift", "pick_place_two", "stay", "wait")  # parts of which the others have, too
+# Of 24 episodes, three standard deviations below the shares of 48 that succeeded: 36 pushes, 41 stacks, at least 44 of
+# each other goal. Which ones do differs between processors, whose physics round differently.
+RECOVERED = {"push": 12, "stack": 15}
+GOALS = ("lift", "pick_place", "pick_place_two", "push", "stack", "stay", "wait")
 
 
 def perturbed(spec: Spec, **changes: Any) -> Perturbed:
@@ -43,10 +43,9 @@ def test_the_expert_solves_every_goal_even_when_it_is_led_astray(goal: str) -> N
     with environment.blind():
         assert sum(rollout(environment, Waypoint(spec), seed).success for seed in range(8)) >= 7
         led_astray = perturbed(spec, noise=0.3)
-        count, recovered = RECOVERED.get(goal, (12, 9))
-        episodes = [rollout(environment, led_astray, seed) for seed in range(count)]
+        episodes = [rollout(environment, led_astray, seed) for seed in range(24)]
     environment.close()
-    assert sum(episode.success for episode in episodes) >= recovered
+    assert sum(episode.success for episode in episodes) >= RECOVERED.get(goal, 18)
     for actions in (episodes[0].actions, episodes[0].executed):
         assert (np.array(spec.low, np.float32) <= actions).all() and (actions <= np.array(spec.high, np.float32)).all()
     for observation, action in zip(episodes[0].observations, episodes[0].actions, strict=True):

@@ -302,9 +302,15 @@ def test_perturbed_demonstrations_are_clean_labels_in_equal_shares(tmp_path: Pat
     assert (apart > 1e-3).mean() > 0.2
 
 
-def test_an_evaluation_is_reported_by_tier(tmp_path: Path) -> None:
-    asked = ("task=metaworld", "task.tasks=[handle-press,coffee-push]", "agent=expert", "evaluate.episodes=2")
-    printed = here(tmp_path, *asked, "cluster.workers=1", "recorder=none", "output=run").stdout
+def test_it_is_collected_learnt_and_reported_by_tier(tmp_path: Path) -> None:
+    printed = here(
+        tmp_path,
+        *("task=metaworld", "task.tasks=[handle-press,coffee-push]", "task.image_size=[32,32]", "task.steps=80"),
+        *("collect.episodes=2", "cluster.workers=1", "trainer.accelerator=cpu", "trainer.max_steps=2"),
+        *("validate.episodes=0", "trainer.val_check_interval=2", "data.batch_size=4", "data.validation_fraction=0"),
+        *("model.width=16", "model.keypoints=4", "model.text_width=8", "evaluate.episodes=2", "recorder=none"),
+        "output=run",
+    ).stdout
     assert re.search(
         r"^easy \d/1 .*\nmedium \d/1 .*\nmean over tiers \(2 of 50 tasks\) .*\nsuccess \d/2 ", printed, re.MULTILINE
     )

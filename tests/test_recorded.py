@@ -145,6 +145,14 @@ def test_names_may_be_grouped_repeated_or_none(
     assert build(composed(copy)["task"], "task").spec.action == expected
 
 
+def test_unnamed_components_are_chosen_by_their_numbers(dataset: Path, tmp_path: Path) -> None:
+    copy = renamed(dataset, tmp_path / "dataset", None)
+    config = composed(copy, "task.action=[action_2,action_0,action_1]", "task.image_size=[12,12]")
+    spec = build(config["task"], "task").spec
+    found = build(config["expert"], "expert", spec=spec).episode(1)
+    np.testing.assert_array_equal(found.actions, episode(1).actions[:, [2, 0, 1]])
+
+
 def test_another_recording_is_not_taken_for_the_stored_one(dataset: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(dataset, tmp_path / "dataset"))
     bounds = ("task.low=[-99,-99,-99]", "task.high=[99,99,99]", "task.image_size=[12,12]")

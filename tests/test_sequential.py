@@ -20,7 +20,7 @@ from vla.rollouts.statements import AgainstBar, AgainstRun
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import FIRST_SEED
 
-SIMULATIONS, MOST = 3_000, 150
+SIMULATIONS, MOST = 10_000, 300
 SEEDS = range(FIRST_SEED, FIRST_SEED + 60)
 
 

@@ -20,7 +20,7 @@ import torch
 import toy
 from composing import composed
 from defaults import defaults_of
-from fake_batch import as_policy, make_act, make_batch, make_bc, make_rt1
+from fake_batch import as_policy, make_act, make_batch, make_bc, make_denoising, make_rt1
 from omegaconf import OmegaConf
 from resuming import STEPS, STOP, VALIDATED, same, train
 from small_training import fit, make_learner
@@ -28,6 +28,7 @@ from small_training import fit, make_learner
 from vla.config.experiment import Experiment
 from vla.io.errors import UserError
 from vla.jobs.train import warn_of_length
+from vla.models.diffusion import Diffusion
 from vla.models.lora import LoRA
 from vla.models.model import Model
 from vla.spec import FIRST_SEED, Array, Observation
@@ -57,7 +58,15 @@ def logged(output: Path) -> list[dict[str, str]]:
     return [row for row in rows if any(value for key, value in row.items() if key not in ("step", "epoch"))]
 
 
-@pytest.mark.parametrize("make", [partial(make_bc, shift=(64, 64)), make_with_factors], ids=["bc", "factors"])
+RESUMED = {
+    "bc": partial(make_bc, shift=(64, 64)),
+    "rt1 with dropout": partial(make_rt1, dropout=0.2),
+    "factors": make_with_factors,
+    "diffusion, which draws": partial(make_denoising, Diffusion),
+}
+
+
+@pytest.mark.parametrize("make", RESUMED.values(), ids=RESUMED.keys())
 def test_going_on_after_an_interruption_gives_the_same_bits(
     make: Callable[[], Model], folder: Path, tmp_path: Path
 ) -> None:

@@ -34,8 +34,9 @@ def worlds(lanes: int, make: Callable[[], ToyEnvironment] = ToyEnvironment) -> l
 
 
 @pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
-def test_episodes_side_by_side_are_those_that_are_played_alone(make: Callable[[], Model]) -> None:
-    policy = as_policy(make(), lanes=2)
+@pytest.mark.parametrize("rows", [1, 2, 4])
+def test_episodes_side_by_side_are_those_that_are_played_alone(make: Callable[[], Model], rows: int) -> None:
+    policy = as_policy(make(), lanes=rows)
     alone = {seed: rollout(Telling(), policy, seed).executed for seed in (2, 3, 4, 5, 9)}
     for lanes, seeds in ((1, [9, 3]), (2, [2, 3, 4, 5, 9]), (4, [9, 5, 4, 3, 2])):
         played = dict(play(worlds(lanes, Telling), policy, seeds, all_images=False))

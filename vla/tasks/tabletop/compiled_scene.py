@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -100,7 +101,7 @@ class CompiledScene:
             self.place_block(index, 0.52, 0.12 * (index - (self.present - 1) / 2), 0.0)
         self.place_arm(self.robot.kinematics.home, self.robot.widest)
 
-    def paint_blocks(self, names: list[str], rgb: Array) -> None:
+    def paint_blocks(self, names: Sequence[str], rgb: Array) -> None:
         """Set each block's colour (count, 3) and its name in instructions."""
         self.block_names = names
         self.model.geom_rgba[self.block_geoms, :3] = rgb

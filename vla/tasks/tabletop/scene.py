@@ -13,7 +13,7 @@ from vla.tasks.tabletop.robot import PHYSICS, VISIBLE, TabletopRobot, attributes
 from vla.tasks.tabletop.robot_file import compiled
 
 ColourName = Literal["red", "green", "blue", "yellow", "purple", "orange"]
-COLOURS: dict[str, tuple[float, float, float]] = {
+COLOURS: dict[ColourName, tuple[float, float, float]] = {
     "red": (0.85, 0.10, 0.10),
     "green": (0.10, 0.65, 0.20),
     "blue": (0.12, 0.25, 0.85),
