@@ -55,10 +55,11 @@ INTO = @.venv/bin/python -m pip install --disable-pip-version-check -q --no-deps
 
 parity: setup .venv/parity/lerobot-0.4.4 .venv/parity/lerobot-0.6.1
 	PYTHONPATH=.venv/parity/lerobot-0.4.4:.:tests .venv/bin/python tools/parity/smolvla.py
+	PYTHONPATH=.venv/parity/lerobot-0.4.4 .venv/bin/python tools/parity/rtc.py tests/rtc_reference.npz
 	PYTHONPATH=.:tests .venv/bin/python tools/parity/pi0.py
 	PYTHONPATH=.venv/parity/lerobot-0.6.1:.:tests .venv/bin/python tools/parity/pi05.py
 	PYTHONPATH=.venv/parity/lerobot-0.6.1:.:tests .venv/bin/python tools/parity/pi_names.py
-	.venv/bin/pytest -q -p no:cacheprovider tests/test_vlm.py tests/test_pi.py tests/test_pi_policy.py # with what was made anew
+	.venv/bin/pytest -q -p no:cacheprovider tests/test_vlm.py tests/test_pi.py tests/test_pi_policy.py tests/test_chunking.py # with what was made anew
 
 .venv/parity/lerobot-0.4.4: .venv/.installed
 	$(INTO) lerobot==0.4.4

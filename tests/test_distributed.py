@@ -14,7 +14,7 @@ from command_line import SMALL, vla
 from defaults import defaults_of
 from lightning_utilities.core.imports import RequirementCache
 from resuming import STOP, same
-from together import PAIRS, TRUNK, composed, train, train_trunk, untrained
+from together import PAIRS, TRUNK, VLAS, composed, train, train_trunk, untrained
 from trunk import make_trunk_model
 
 from vla.config.experiment import make_policy
@@ -69,6 +69,11 @@ def test_two_processes_learn_what_one_learns_in_a_trunk_whose_layers_they_share(
         torch.testing.assert_close(ends[1][name], value, rtol=1e-3, atol=1e-4, msg=name)
         if ".trunk." in name and ".lora_" not in name:
             assert torch.equal(value, start[name.replace(".base_layer", "")])
+
+
+def test_two_processes_share_the_layers_of_vision_language_action_models(together: Path) -> None:
+    off = torch.load(together / "vlas.pt", weights_only=True)
+    assert off.keys() == VLAS.keys() and max(off.values()) < 1e-5
 
 
 @pytest.mark.parametrize("pair", PAIRS)

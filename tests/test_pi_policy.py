@@ -14,7 +14,19 @@ import torch
 from command_line import SMALL, here
 from defaults import defaults_of, part_of
 from safetensors.torch import load_file, save_file
-from tiny_pi import KINDS, SIZES, SPEC, batch_of, make_network, make_policy, observed, take_statistics, write_tokenizer
+from tiny_pi import (
+    KINDS,
+    SIZES,
+    SPEC,
+    STATISTICS,
+    batch_of,
+    export,
+    make_network,
+    make_policy,
+    observed,
+    take_statistics,
+    write_tokenizer,
+)
 from tiny_vla import REFERENCE, deviation, published, reference
 from torch import Tensor
 
@@ -30,8 +42,9 @@ TOLERANCE = 1e-5
 each = pytest.mark.parametrize("name", KINDS)
 
 
-def test_the_way_from_observations_to_commands_is_that_of_lerobot(tmp_path: Path) -> None:
-    model, given, theirs = make_policy("pi05", write_tokenizer(tmp_path)), observed(), reference("pi05")
+@pytest.mark.parametrize(("name", "file"), [("pi0", "pi0_policy"), ("pi05", "pi05")])
+def test_the_way_from_observations_to_commands_is_that_of_lerobot(name: str, file: str, tmp_path: Path) -> None:
+    model, given, theirs = make_policy(name, write_tokenizer(tmp_path)), observed(), reference(file)
     take_statistics(model)
     state, batch = model.state_normalizer(given["state"]), batch_of(model)
     tokens, sentence = model.text(batch["text"], state), theirs["way.sentence"].bool()
@@ -60,8 +73,20 @@ def test_names_and_shapes_are_those_that_are_published(name: str) -> None:
     ours = {weight: [*tensor.shape] for weight, tensor in network.named_parameters()}
     used = {weight: shape for weight, shape in shapes.items() if not weight.startswith(network.unused)}
     assert {renamed(weight, network.published): shape for weight, shape in used.items()} == ours
+    assert len(used) == len(ours)  # no two are one
     head = "model.vlm_with_expert.vlm" if name == "smolvla" else "paligemma_with_expert.gemma_expert"
     assert shapes.keys() - used.keys() == {f"{head}.lm_head.weight"}
+
+
+@each
+def test_what_is_exported_has_every_name_that_is_published(name: str, tmp_path: Path) -> None:
+    """Otherwise LeRobot's classes say that it could not be loaded."""
+    export(name, tmp_path)
+    written, head = load_file(tmp_path / "exported/model.safetensors"), "paligemma_with_expert.gemma_expert.lm_head."
+    ours = {weight: tensor for weight, tensor in published(make_network(name))}
+    assert written.keys() == {f"model.{weight}" for weight in (*ours, f"{head}weight")}
+    assert written[f"model.{head}weight"].shape == (SIZES["vocabulary"], SIZES["expert_width"])
+    assert all(torch.equal(written[f"model.{weight}"], tensor) for weight, tensor in ours.items())
 
 
 def write_published(folder: Path, name: str) -> dict[str, Tensor]:
@@ -78,11 +103,11 @@ def write_published(folder: Path, name: str) -> dict[str, Tensor]:
     file = "policy_preprocessor_step_2_normalizer_processor.safetensors"
     steps = [{"registry_name": "normalizer_processor", "config": {}, "state_file": file}]
     (folder / "policy_preprocessor.json").write_text(json.dumps({"name": "policy_preprocessor", "steps": steps}))
-    given, kinds = observed(), ("mean", "std") if name == "pi0" else ("q01", "q99")
+    given = observed()
     statistics = {
         f"{feature}.{kind}": given[f"{feature.rpartition('.')[2]}.{quantile}"]
         for feature in ("observation.state", "action")
-        for kind, quantile in zip(kinds, ("q01", "q99"), strict=True)
+        for kind, quantile in zip(STATISTICS[name], ("q01", "q99"), strict=True)
     }
     save_file(statistics, folder / file)
     return weights
@@ -105,7 +130,9 @@ def test_published_weights_and_statistics_are_loaded_and_a_missing_weight_is_nam
     saved = load_file(tmp_path / "model.safetensors")
     lost = next(weight for weight in saved if "lm_head" not in weight)
     save_file({weight: tensor for weight, tensor in saved.items() if weight != lost}, tmp_path / "model.safetensors")
-    with pytest.raises(UserError, match=f"lacks {re.escape(renamed(lost, model.network.published))} and 0 other"):
+    with pytest.raises(
+        UserError, match=f"lacks weights of the model: {re.escape(renamed(lost, model.network.published))}$"
+    ):
         make_policy(name, text, trunk=str(tmp_path))
 
 

@@ -16,6 +16,7 @@ from command_line import SMALL, here
 from defaults import defaults_of
 from fake_batch import as_policy, make_batch, overfit, with_text
 from safetensors.torch import load_file, save_file
+from saved_policies import change_json
 from small_training import CONFIG, loader, make_trainer, save
 from tiny_vla import (
     CHUNK,
@@ -327,7 +328,7 @@ def test_a_trunk_alone_leaves_the_expert_random(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda w: w.pop("model.state_proj.bias"), "lacks state_proj.bias"),
+        (lambda w: w.pop("model.state_proj.bias"), "lacks weights of the model: state_proj.bias$"),
         (lambda w: w.update({"model.other.bias": torch.zeros(1)}), "has model.other.bias, which the model lacks"),
         (lambda w: w.update({"model.state_proj.bias": torch.zeros(5)}), "model.state_proj.bias in .* has the shape"),
     ],
@@ -336,6 +337,41 @@ def test_other_weights_are_refused(tmp_path: Path, tokenizer: Path, change: Any,
     folder = written(tmp_path / "published", tokenizer, change)
     with pytest.raises(UserError, match=sentence):
         make_smolvla(tokenizer, trunk=str(folder))
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"num_expert_layers": 8}, "was trained with num_expert_layers=8, and only -1 is known"),
+        ({"max_period": 2.0}, r"was trained with max_period=2\.0, and only 4\.0 is known"),
+        ({"type": "act"}, "is a policy of LeRobot's type act: of smolvla, pi0, pi05 there are models here"),
+    ],
+)
+def test_policies_of_other_options_and_types_are_refused(
+    tmp_path: Path, tokenizer: Path, options: dict[str, Any], sentence: str
+) -> None:
+    folder = written(tmp_path / "published", tokenizer)
+    change_json(folder / "config.json", lambda config: config | options)
+    with pytest.raises(UserError, match=sentence):
+        make_smolvla(tokenizer, trunk=str(folder))
+
+
+def test_the_options_of_the_published_policy_are_known(tmp_path: Path, tokenizer: Path) -> None:
+    # Those of lerobot/smolvla_base at c83c3163 that are not LeRobot's defaults, as copies of its config.json have them.
+    published = {"num_expert_layers": 0, "prefix_length": 0, "pad_language_to": "max_length"}
+    folder = written(tmp_path / "published", tokenizer)
+    change_json(folder / "config.json", lambda config: config | published)
+    assert make_smolvla(tokenizer, trunk=str(folder)).network.state_width
+
+
+@pytest.mark.parametrize("trunk", [True, False])
+def test_a_network_larger_than_the_free_memory_is_refused_before_it_is_built(
+    trunk: bool, tmp_path: Path, tokenizer: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = written(tmp_path / "published", tokenizer) if trunk else None
+    monkeypatch.setattr("vla.models.vlm.trunk.free_memory", lambda: 1000)
+    with pytest.raises(UserError, match=r"SmolVLA need .* GB of memory, and 0\.0 GB are free: use a machine with more"):
+        make_smolvla(tokenizer, trunk=folder and str(folder))
 
 
 def test_a_normaliser_without_the_action_and_a_camera_without_counterpart_are_refused(
@@ -403,4 +439,4 @@ def test_a_published_policy_is_fine_tuned_and_evaluated_from_the_command_line(ho
     theirs, ours = published[f"model.vlm_with_expert.vlm.model.{name}"], tuned.get(f"network.vlm.{name}")
     assert ours is None or torch.equal(theirs, ours)
     assert not torch.equal(published["model.state_proj.weight"], tuned["network.state_proj.weight"])
-    assert json.loads((home / "second/policy/config.json").read_text())["model"]["trunk"] == "published"
+    assert json.loads((home / "second/policy/config.json").read_text())["model"]["trunk"] == str(home / "published")

@@ -37,7 +37,8 @@ SIZES: dict[str, Any] = {
 }
 STATE_WIDTH = 8  # of π0
 CHUNK, STEPS = 10, 10
-LENGTH = 56  # of a prompt, for which one of `TASKS` is too long
+LENGTHS = {"pi0": 16, "pi05": 56}  # of a prompt, for which one of `TASKS` is too long
+STATISTICS = {"pi0": ("mean", "std"), "pi05": ("q01", "q99")}
 KINDS: dict[str, type[FlowNetwork]] = {"pi0": PI0, "pi05": PI05}
 
 # Of the whole way from an observation to a command: state and action are narrower than what they are padded to.
@@ -118,7 +119,7 @@ def make_network(name: str, **changes: Any) -> FlowNetwork:
 
 def make_policy(name: str, tokenizer: Path | None = None, **options: Any) -> VisionLanguageAction:
     """The policy of an option with a tiny network of the weights of `fill`, unless a trunk gives them."""
-    text = part_of(f"model/{name}", "text", name=tokenizer and str(tokenizer), length=LENGTH)
+    text = part_of(f"model/{name}", "text", name=tokenizer and str(tokenizer), length=LENGTHS[name])
     return VisionLanguageAction(
         partial(make_network, name, **({} if tokenizer else {"vocabulary": WORDS})),
         partial(Prompt, **text),
@@ -129,10 +130,11 @@ def make_policy(name: str, tokenizer: Path | None = None, **options: Any) -> Vis
 
 
 def take_statistics(model: VisionLanguageAction) -> None:
-    """Normalise by the quantiles of `observed`."""
+    """Normalise by the quantiles of `observed`, which may take the place of mean and standard deviation."""
     given = observed()
     for normalizer, name in ((model.state_normalizer, "state"), (model.action_normalizer, "action")):
-        normalizer.take(given, name, "the dataset")
+        pair = zip(normalizer.statistics, ("q01", "q99"), strict=True)
+        normalizer.take({f"{name}.{own}": given[f"{name}.{quantile}"] for own, quantile in pair}, name, "the dataset")
 
 
 def batch_of(model: VisionLanguageAction) -> dict[str, Any]:
@@ -147,8 +149,8 @@ def batch_of(model: VisionLanguageAction) -> dict[str, Any]:
     }
 
 
-def export_pi05(folder: Path) -> None:
-    """Write π0.5 with the statistics of `observed` as LeRobot has it, in `folder`/exported."""
-    model = make_policy("pi05", write_tokenizer(folder))
+def export(name: str, folder: Path) -> None:
+    """Write a policy with the statistics of `observed` as LeRobot has it, in `folder`/exported."""
+    model = make_policy(name, write_tokenizer(folder))
     take_statistics(model)
     LeRobotPolicyExporter(folder / "exported").export(as_policy(model, SPEC))

@@ -5,9 +5,12 @@ python together.py STORE FOLDER
 
 from __future__ import annotations
 
+import copy
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import composing
 import lightning
@@ -16,20 +19,26 @@ import resuming
 import torch
 import toy
 from defaults import defaults_of
-from fake_batch import make_rt1
+from fake_batch import make_batch, make_rt1, with_text
 from small_training import CONFIG
+from tiny_pi import KINDS, make_policy
+from tiny_vla import deviation, make_smolvla
+from torch.distributed.device_mesh import init_device_mesh
 from trunk import make_trunk_model
 
 from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
+from vla.models.fsdp import full_tensor, shard
 from vla.models.learner import Learner
 from vla.models.lora import LoRA
 from vla.models.policy_folder import POLICY
+from vla.models.recomputation import recompute_layers
 from vla.runs.folder import LAST
 from vla.training.trainer import make_trainer, quiet_lightning
 
 PAIRS = ("ddp,rt1_tiny", "fsdp,decoder")  # trainer, model
 TRUNK = "fsdp,trunk"
+VLAS = {"smolvla": make_smolvla, **{name: partial(make_policy, name) for name in KINDS}}
 SMALL = (
     "collect.episodes=30",
     "data.validation_fraction=0.2",
@@ -105,6 +114,27 @@ def train_trunks(store: Path, folder: Path) -> None:
     torch.save(found, folder / TRUNK / "found.pt")
 
 
+def share_vlas(store: Path, folder: Path) -> None:
+    """Leave how far gradients of vision-language-action models, whose layers two processes share, are from others."""
+    off = dict[str, float]()
+    for name, make in VLAS.items():
+        torch.manual_seed(0)
+        model = make()
+        batch = model.noised(with_text(model, make_batch(1, model.chunk, spec=model.spec, size=2)))
+        LoRA(**defaults_of("learner/lora/low_rank", rank=2)).inject(model)
+        recompute_layers(model.train())
+        whole = copy.deepcopy(model)
+        with patch("vla.models.fsdp.MIN_PARAMETERS", 1000):
+            shard(model, init_device_mesh("cpu", (1, 2), mesh_dim_names=("copies", "shards")))
+        ways = list[torch.Tensor]()
+        for each in (model, whole):
+            each.loss(batch)["loss"].backward()
+            gradients = [full_tensor(weight.grad) for weight in each.parameters() if weight.grad is not None]
+            ways.append(torch.cat([gradient.flatten() for gradient in gradients]))
+        off[name] = deviation(*ways)
+    torch.save(off, folder / "vlas.pt")
+
+
 def train_in_pieces(store: Path, folder: Path) -> None:
     """Save the checkpoints of an uninterrupted training, of its first half, and of the resumed second half."""
     model = make_rt1(dropout=0.2)
@@ -118,5 +148,5 @@ def train_in_pieces(store: Path, folder: Path) -> None:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     store, folder = Path(sys.argv[1]), Path(sys.argv[2])
-    for leave in (train_pairs, train_trunks, train_in_pieces):
+    for leave in (train_pairs, train_trunks, train_in_pieces, share_vlas):
         leave(store, folder)

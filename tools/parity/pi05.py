@@ -1,7 +1,9 @@
-"""Compares π0.5 with LeRobot's own, of equal weights, noise and times, and writes what the tests compare with.
+"""Compares π0 and π0.5 with LeRobot's own, of equal weights, noise and times, and writes what the tests compare with.
 
-Of the way around the network: images, prompts, normalised states and actions, and commands made of raw observations.
-LeRobot 0.6 with transformers 5.5 are in a folder of their own: PYTHONPATH=FOLDER:.:tests python tools/parity/pi05.py
+Of π0.5 the network, and of both the way around it: images, prompts, normalised states and actions, and commands made of
+raw observations. LeRobot 0.6 with transformers 5.5 are in a folder of their own:
+
+    PYTHONPATH=FOLDER:.:tests python tools/parity/pi05.py
 """
 
 from __future__ import annotations
@@ -18,13 +20,16 @@ import lerobot_modules  # first: it makes the imports of LeRobot possible
 import newer_python  # noqa: F401
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.pi0 import modeling_pi0
+from lerobot.policies.pi0.configuration_pi0 import PI0Config
+from lerobot.policies.pi0.processor_pi0 import make_pi0_pre_post_processors
 from lerobot.policies.pi05 import modeling_pi05
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.pi05.processor_pi05 import make_pi05_pre_post_processors
 from lerobot.processor import tokenizer_processor
 from references import TOLERANCE, write
 from safetensors.torch import load_file
-from tiny_pi import CHUNK, LENGTH, SIZES, STEPS, TASKS, inputs, observed, tokenizer
+from tiny_pi import CHUNK, LENGTHS, SIZES, STATE_WIDTH, STATISTICS, STEPS, TASKS, inputs, observed, tokenizer
 from tiny_vla import deviation, fill
 from torch import Tensor
 from transformers import GemmaConfig, PaliGemmaConfig, PreTrainedTokenizerFast
@@ -35,11 +40,16 @@ GRADIENTS = {  # of the network, by its names here → LeRobot's
     "paligemma.language_model.layers.0.self_attn.v_proj.weight": "paligemma.model.",
     "expert.layers.1.input_layernorm.dense.weight": "gemma_expert.model.",
 }
+LEROBOT: dict[str, tuple[Any, Any, Any, Any]] = {  # module, policy, its configuration and its processors
+    "pi0": (modeling_pi0, modeling_pi0.PI0Policy, PI0Config, make_pi0_pre_post_processors),
+    "pi05": (modeling_pi05, modeling_pi05.PI05Policy, PI05Config, make_pi05_pre_post_processors),
+}
 
 
-def their_policy() -> modeling_pi05.PI05Policy:
+def their_policy(name: str) -> Any:
     """LeRobot's policy with a network of other sizes."""
-    own = modeling_pi05.PaliGemmaForConditionalGenerationWithPiGemma
+    module, kind, configured, _ = LEROBOT[name]
+    own = module.PaliGemmaForConditionalGenerationWithPiGemma
 
     def trunk(config: Any) -> Any:
         """Without the sizes that it sets in any case."""
@@ -52,14 +62,14 @@ def their_policy() -> modeling_pi05.PI05Policy:
         **{"hidden_size": SIZES["vision_width"], "num_hidden_layers": SIZES["vision_layers"]},
         **{"num_attention_heads": SIZES["vision_heads"], "patch_size": SIZES["patch"], "vision_use_head": False},
     }
-    gemma = modeling_pi05.GemmaConfig
+    gemma = module.GemmaConfig
     heads = (SIZES["layers"], SIZES["heads"], SIZES["head_width"])
-    modeling_pi05.PaliGemmaForConditionalGenerationWithPiGemma = trunk
-    modeling_pi05.CONFIG_MAPPING = {
+    module.PaliGemmaForConditionalGenerationWithPiGemma = trunk
+    module.CONFIG_MAPPING = {
         "paligemma": lambda: PaliGemmaConfig(vision_config={"model_type": "siglip_vision_model", **vision}),
-        "gemma": lambda **options: GemmaConfig(**{**options, "vocab_size": 4}),
+        "gemma": lambda **options: GemmaConfig(**{**options, "vocab_size": SIZES["vocabulary"]}),
     }
-    modeling_pi05.get_gemma_config = lambda variant: gemma(
+    module.get_gemma_config = lambda variant: gemma(
         **{"depth": heads[0], "num_heads": heads[1], "num_kv_heads": 1, "head_dim": heads[2]},
         width=SIZES["width" if variant == "gemma_2b" else "expert_width"],
         mlp_dim=SIZES["feedforward" if variant == "gemma_2b" else "expert_feedforward"],
@@ -67,13 +77,14 @@ def their_policy() -> modeling_pi05.PI05Policy:
     size = SIZES["resolution"]
     images = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, size, size)) for name in CAMERAS}
     state = {"observation.state": PolicyFeature(FeatureType.STATE, (5,))}
-    config = PI05Config(
+    config = configured(
         **{"chunk_size": CHUNK, "n_action_steps": CHUNK, "max_action_dim": SIZES["action_width"], "device": "cpu"},
-        **{"num_inference_steps": STEPS, "image_resolution": (size, size), "tokenizer_max_length": LENGTH},
+        **{"num_inference_steps": STEPS, "image_resolution": (size, size), "tokenizer_max_length": LENGTHS[name]},
+        max_state_dim=STATE_WIDTH,
         input_features={**images, **state},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (5,))},
     )
-    policy = modeling_pi05.PI05Policy(config).eval()
+    policy = kind(config).eval()
     fill((name.removeprefix("model."), weight) for name, weight in policy.state_dict().items())
     trunk = policy.model.paligemma_with_expert.paligemma
     trunk.model.language_model.embed_tokens.weight.data.copy_(trunk.lm_head.weight)  # one matrix is published as both
@@ -122,14 +133,17 @@ def raw() -> dict[str, Any]:
     return {**images, "observation.state": given["state"], "action": given["actions"], "task": [*TASKS]}
 
 
-def way_results(policy: modeling_pi05.PI05Policy) -> dict[str, Tensor]:
+def way_results(name: str, policy: Any) -> dict[str, Tensor]:
     """Return what LeRobot makes of raw observations, and the commands it makes of what the network answers."""
     given = observed()
     statistics = {
-        name: {each: given[f"{name.rpartition('.')[2]}.{each}"] for each in ("q01", "q99")}
-        for name in ("observation.state", "action")
+        feature: {
+            each: given[f"{feature.rpartition('.')[2]}.{quantile}"]
+            for each, quantile in zip(STATISTICS[name], ("q01", "q99"), strict=True)
+        }
+        for feature in ("observation.state", "action")
     }
-    before, after = make_pi05_pre_post_processors(policy.config, statistics)
+    before, after = LEROBOT[name][-1](policy.config, statistics)
     batch = before(raw())
     seen, present = policy._preprocess_images(batch)
     return {
@@ -143,18 +157,18 @@ def way_results(policy: modeling_pi05.PI05Policy) -> dict[str, Tensor]:
     }
 
 
-def exported_results(folder: Path) -> Tensor:
+def exported_results(name: str, folder: Path) -> Tensor:
     """Return the commands of LeRobot's policy and processors that are loaded from what is exported here."""
     # With the newer transformers of this project, in which modules of the image encoder have other names.
-    code = f"from tiny_pi import *; export_pi05(Path({str(folder)!r}))"
+    code = f"from tiny_pi import *; export({name!r}, Path({str(folder)!r}))"
     ours = os.environ["PYTHONPATH"].partition(os.pathsep)[2]
     subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": ours}, check=True)
-    theirs = modeling_pi05.PI05Policy.from_pretrained(folder / "exported", strict=False)
+    theirs = LEROBOT[name][1].from_pretrained(folder / "exported")
     state, written = theirs.state_dict(), load_file(folder / "exported/model.safetensors")
-    assert all(torch.equal(state[name], weight) for name, weight in written.items())
-    # The former is the same matrix as that of the head, and no action depends on the latter.
-    missing = {"paligemma.model.language_model.embed_tokens.weight", "gemma_expert.lm_head.weight"}
-    assert state.keys() - written.keys() == {f"model.paligemma_with_expert.{name}" for name in missing}
+    assert all(torch.equal(state[weight], tensor.float()) for weight, tensor in written.items())
+    # That is the same matrix as that of the head.
+    missing = {"model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"}
+    assert state.keys() - written.keys() == missing
     before, after = lerobot_modules.processors_of(folder / "exported")
     return after(theirs.predict_action_chunk(before(raw()), noise=observed()["noise"]))
 
@@ -162,13 +176,15 @@ def exported_results(folder: Path) -> Tensor:
 def main() -> None:
     """Write what LeRobot computes, and print how far it is from what was written before."""
     without_hub()
-    policy = their_policy()
-    results = {**network_results(policy.model), **way_results(policy)}
-    write("pi05", results)
-    with TemporaryDirectory() as folder:
-        off = deviation(exported_results(Path(folder)), results["way.commands"])
-        print(f"commands of our export {off:.1e}")
-        assert off <= TOLERANCE
+    for name in LEROBOT:
+        policy = their_policy(name)
+        of_network = network_results(policy.model) if name == "pi05" else {}
+        results = {**of_network, **way_results(name, policy)}
+        write("pi05" if of_network else "pi0_policy", results)
+        with TemporaryDirectory() as folder:
+            off = deviation(exported_results(name, Path(folder)), results["way.commands"])
+            print(f"{name}: commands of our export {off:.1e}")
+            assert off <= TOLERANCE
 
 
 if __name__ == "__main__":

@@ -110,7 +110,7 @@ def compare_policies(folder: Path) -> dict[str, Tensor]:
     ours = as_policy(model, SPEC)
     LeRobotPolicyExporter(folder / "exported").export(ours)
     without_hub(trunk_config(SMOLVLA))
-    theirs = SmolVLAPolicy.from_pretrained(folder / "exported", strict=False)
+    theirs = SmolVLAPolicy.from_pretrained(folder / "exported", strict=True)
     weights = dict(theirs.model.named_parameters())
     assert all(torch.equal(weights[name], weight) for name, weight in published(model.network))
     before, after = lerobot_modules.processors_of(folder / "exported")

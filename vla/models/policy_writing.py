@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import math
@@ -55,6 +56,7 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
     config, spec = content["config"], content["spec"]
     names = (*files.REQUIRED_NODES, *files.OPTIONAL_NODES, "seed", "pretrained")
     nodes = {name: config[name] for name in names if name in config}
+    nodes["model"] = _located(nodes["model"])
     validate = config.get("validate") or {}
     # The data module saves the digest of the demonstrations, under a key of its class that is not known here.
     states = [part for part in content.values() if isinstance(part, dict)]
@@ -90,6 +92,15 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
         for file in draft.iterdir():
             with file.open("rb") as written:
                 os.fsync(written.fileno())
+
+
+def _located(model: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the node of a model with absolute names of folders of weights, which are found from any other folder."""
+    located = copy.deepcopy({**model})
+    for node, key in ((located, "trunk"), (located.get("text"), "name")):
+        if isinstance(node, dict) and node.get(key) and Path(node[key]).is_dir():
+            node[key] = str(Path(node[key]).resolve())
+    return located
 
 
 def _card(config: Mapping[str, Any], spec: Mapping[str, Any], training: files.Training, count: int) -> str:

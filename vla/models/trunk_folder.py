@@ -15,19 +15,29 @@ from vla.models.hub import HUB, fetch
 CONFIG, WEIGHTS = "config.json", "model*.safetensors"
 FILES = (CONFIG, "policy_*", WEIGHTS)
 ADVICE = "give the folder of a download, or leave it out for random weights"
-OF_OTHERS = {"model_type", "input_features"}  # in the config of transformers, and of a policy of LeRobot
+OF_OTHERS = ("model_type", "input_features")  # in the config of transformers, and of a policy of LeRobot
 
 
 def is_trunk(name: str) -> bool:
     """Return whether `name` is a folder of weights that others published, or names it on the hub.
 
     Raises:
-        UserError: the hub cannot be reached.
+        UserError: the hub cannot be reached, there is no such folder, or its config is of an unknown kind.
     """
     if name.startswith(HUB) and "@" not in name:
         return True  # a policy of this project is named with its revision
-    path = (fetch(name, CONFIG, advice=ADVICE) if name.startswith(HUB) else Path(name)) / CONFIG
-    return path.is_file() and not OF_OTHERS.isdisjoint(read_json(path, dict[str, Any]))
+    folder = fetch(name, CONFIG, advice=ADVICE) if name.startswith(HUB) else Path(name)
+    if not folder.exists():
+        raise UserError(
+            f"there is no policy and no download '{name}': name a run, as in outputs/runs/…, its policy, a folder with "
+            f"{CONFIG} and model.safetensors, or {HUB}…"
+        )
+    if not (folder / CONFIG).is_file():
+        return False
+    config = read_json(folder / CONFIG, dict[str, Any])
+    if config.keys().isdisjoint((*OF_OTHERS, "model")):
+        raise UserError(f"{folder / CONFIG} has neither {' nor '.join(OF_OTHERS)}: download the model again")
+    return not config.keys().isdisjoint(OF_OTHERS)
 
 
 def trunk_folder(name: str) -> Path:

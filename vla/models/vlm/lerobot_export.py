@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from vla.io.errors import UserError
@@ -53,6 +54,9 @@ class LeRobotPolicyExporter:
         beginnings = [(ours, theirs) for theirs, ours in model.network.published]
         state = model.network.state_dict()
         weights = {renamed(name, beginnings): tensor.detach().cpu().contiguous() for name, tensor in state.items()}
+        # No action depends on these, but LeRobot's π0 and π0.5 say that they could not be loaded where one is missing.
+        shape = model.network.vocabulary, model.network.unused_width
+        weights[f"{model.network.unused[0]}weight"] = torch.zeros(shape, dtype=torch.bfloat16)
         config, steps = _config(model), (_preprocessing(model), _postprocessing(model))
         with atomic_path(self._folder) as draft:
             draft.mkdir(parents=True)

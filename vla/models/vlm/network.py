@@ -21,6 +21,7 @@ from vla.io.types import Count, Layers, Width
 MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the embedding of a time
 
 Rotation = tuple[Tensor, Tensor]  # cosines and sines of positions, (B, N, H) each
+Layered = tuple[Tensor, Tensor, Tensor]  # tokens after a layer, (B, N, E), and their keys and values in it
 
 
 class Prefix(NamedTuple):
@@ -46,12 +47,28 @@ class Own:
     def __init__(self, others: tuple[Tensor, Tensor] | None = None) -> None:
         self._others = others
 
-    def update(self, keys: Tensor, values: Tensor, layer: int) -> tuple[Tensor, Tensor]:
-        """Keep (B, heads, N, width of a head) keys and values, and return all that are seen."""
+    def update(self, keys: Tensor, values: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+        """Keep (B, heads, N, width of a head) keys and values, and return all that are seen.
+
+        Versions of transformers differ in what else they pass.
+        """
         self.keys, self.values = keys, values
         if self._others is None:
             return keys, values
         return torch.cat([self._others[0], keys], 2), torch.cat([self._others[1], values], 2)
+
+
+class WithKeys(nn.Module):
+    """A base in front of a layer of transformers, which returns keys and values beside its tokens.
+
+    Were they left in a cache, their gradients would come past FSDP, which gathers the weights of a layer for them.
+    """
+
+    def forward(self, hidden: Tensor, others: tuple[Tensor, Tensor] | None = None, **attention: Any) -> Layered:
+        """Pass (B, N, E) tokens, which attend to others before them too, whose keys and values are given."""
+        own, layer = Own(others), super()
+        hidden = layer.forward(hidden, past_key_values=own, **attention)
+        return hidden, own.keys, own.values
 
 
 class LastLayer(nn.Module):
@@ -67,15 +84,14 @@ class LastLayer(nn.Module):
         self.self_attn.q_proj, self.self_attn.o_proj = Unused(layer.self_attn.q_proj), Unused(layer.self_attn.o_proj)
         self.post_attention_layernorm, self.mlp = Unused(layer.post_attention_layernorm), Unused(layer.mlp)
 
-    def forward(self, hidden: Tensor, position_embeddings: Rotation, past_key_values: Own, **_: Any) -> Tensor:
-        """Leave keys and values of (B, N, E) tokens in `past_key_values`, and return the tokens as they are."""
+    def forward(self, hidden: Tensor, position_embeddings: Rotation, **_: Any) -> Layered:
+        """Return (B, N, E) tokens as they are, with their keys and values."""
         normed, attention = self.input_layernorm(hidden), self.self_attn
         keys, values = (
             project(normed).unflatten(-1, (-1, attention.head_dim)).transpose(1, 2)
             for project in (attention.k_proj, attention.v_proj)
         )
-        past_key_values.update(apply_rotary_pos_emb(keys, keys, *position_embeddings)[1], values, attention.layer_idx)
-        return hidden
+        return hidden, apply_rotary_pos_emb(keys, keys, *position_embeddings)[1], values
 
 
 class Unused(nn.Module):
@@ -93,9 +109,19 @@ class Unused(nn.Module):
             self.add_module(name, Unused(child))
 
 
-def shorten(trunk: Any) -> None:
-    """Let a Llama or Gemma of transformers end, in place, with the keys and values of its last layer."""
+def shorten(trunk: Any, kind: type[WithKeys]) -> None:
+    """Let a Llama or Gemma of transformers end, in place, with the keys and values of its last layer.
+
+    All layers return theirs: `kind` is that class of them.
+    """
+    return_keys(trunk, kind)
     trunk.layers[-1], trunk.norm = LastLayer(trunk.layers[-1]), Unused(trunk.norm)
+
+
+def return_keys(network: Any, kind: type[WithKeys]) -> None:
+    """Make the layers of a Llama or Gemma of transformers those of a class, in place."""
+    for layer in network.layers:
+        layer.__class__ = kind
 
 
 class FlowNetwork(nn.Module, ABC):
@@ -123,13 +149,15 @@ class FlowNetwork(nn.Module, ABC):
     # beginnings of names there and here. The first that fits counts.
     published: ClassVar[tuple[tuple[str, str], ...]] = ()
     pretrained: ClassVar[tuple[tuple[str, str], ...]] = ()
-    unused: ClassVar[tuple[str, ...]] = ()  # beginnings of published names that no action depends on
+    # Beginnings of the published names of an output of words, which no action depends on; LeRobot's comes first.
+    unused: ClassVar[tuple[str, ...]] = ()
 
     kind: ClassVar[str] = ""  # LeRobot's name of the policy
     causal: ClassVar[bool] = False  # whether an action attends to none after it
 
     state_width: int  # S, padded with zeros; 0: the state is part of the sentence
     value_width: int  # values of a token in a layer, of all heads
+    unused_width: int  # of a token from which words would be put out
 
     def __init__(
         self,

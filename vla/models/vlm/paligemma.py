@@ -15,9 +15,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from transformers import GemmaConfig, GemmaModel, PaliGemmaConfig, PaliGemmaModel, SiglipVisionConfig
+from transformers.models.gemma.modeling_gemma import GemmaDecoderLayer
 
 from vla.io.types import Inherited
-from vla.models.vlm.network import FlowNetwork, Own, Prefix, shorten
+from vla.models.vlm.network import FlowNetwork, Prefix, WithKeys, return_keys, shorten
 
 NAMES = (  # of weights, published and here
     ("paligemma_with_expert.paligemma.lm_head.", "paligemma.language_model.embed_tokens."),  # one matrix is both
@@ -34,6 +35,10 @@ TRUNK = (  # the same of PaliGemma alone
 HEADS = ("model.", "")  # of published names: what LeRobot saves begins with the former, what openpi saves does not
 
 
+class GemmaLayer(WithKeys, GemmaDecoderLayer):
+    """A layer of Gemma."""
+
+
 class PaliGemmaWithExpert(FlowNetwork):
     """What π0 and π0.5 share: the trunk, the expert, and attention between them.
 
@@ -46,7 +51,7 @@ class PaliGemmaWithExpert(FlowNetwork):
 
     def __init__(self, **inherited: Inherited) -> None:
         super().__init__(**inherited)
-        self.state_width, self.value_width = 0, self.head_width
+        self.state_width, self.value_width, self.unused_width = 0, self.head_width, self.expert_width
         shared = {**self.shared, "num_key_value_heads": 1}
         self.paligemma = _trunk({**shared, **self.text}, self.vision)
         self.expert = _expert({**shared, **self.of_expert})
@@ -86,11 +91,11 @@ class PaliGemmaWithExpert(FlowNetwork):
         mask = everything[:, None, None, :].expand(-1, 1, hidden.shape[1], -1)
         keys, values = [], []
         for number, layer in enumerate(gemma.layers):
-            own = Own() if prefix is None else Own((prefix.keys[number], prefix.values[number]))
-            attention = {"attention_mask": mask, "position_embeddings": rotation, "past_key_values": own}
-            hidden = layer(hidden, **attention, **condition)
-            keys.append(own.keys)
-            values.append(own.values)
+            others = None if prefix is None else (prefix.keys[number], prefix.values[number])
+            attention = {"attention_mask": mask, "position_embeddings": rotation, "others": others}
+            hidden, own_keys, own_values = layer(hidden, **attention, **condition)
+            keys.append(own_keys)
+            values.append(own_values)
         return hidden, Prefix(tuple(keys), tuple(values), present)
 
 
@@ -101,7 +106,7 @@ def _trunk(text: dict[str, Any], vision: dict[str, Any]) -> PaliGemmaModel:
     trunk = PaliGemmaModel(
         PaliGemmaConfig(vision_config=encoder, text_config=GemmaConfig(**text), projection_dim=width)
     )
-    shorten(trunk.language_model)
+    shorten(trunk.language_model, GemmaLayer)
     return trunk
 
 
@@ -110,6 +115,7 @@ def _expert(sizes: dict[str, int]) -> GemmaModel:
     # Ids of the tokens of no text must be within its vocabulary, too.
     expert = GemmaModel(GemmaConfig(**sizes, vocab_size=1, pad_token_id=0, bos_token_id=0, eos_token_id=0))
     del expert.embed_tokens
+    return_keys(expert, GemmaLayer)
     return expert
 
 

@@ -14,7 +14,7 @@ from transformers import GemmaConfig
 from transformers.models.gemma.modeling_gemma import GemmaAttention, GemmaMLP
 
 from vla.io.types import Inherited
-from vla.models.vlm.network import Prefix, time_embedding
+from vla.models.vlm.network import Layered, Own, Prefix, time_embedding
 from vla.models.vlm.paligemma import PaliGemmaWithExpert
 
 
@@ -83,9 +83,12 @@ class AdaptiveLayer(nn.Module):
         self.input_layernorm = AdaptiveNorm(config.hidden_size, config.rms_norm_eps)
         self.post_attention_layernorm = AdaptiveNorm(config.hidden_size, config.rms_norm_eps)
 
-    def forward(self, hidden: Tensor, condition: Tensor, **attention: Any) -> Tensor:
-        """Return (B, N, E) tokens, given the condition of the norms and the arguments of the attention."""
+    def forward(
+        self, hidden: Tensor, condition: Tensor, others: tuple[Tensor, Tensor] | None, **attention: Any
+    ) -> Layered:
+        """Pass (B, N, E) tokens, given the condition of the norms, what else they see, and how they attend."""
+        own = Own(others)
         normal, gate = self.input_layernorm(hidden, condition)
-        hidden = hidden + self.self_attn(normal, **attention)[0] * gate
+        hidden = hidden + self.self_attn(normal, past_key_values=own, **attention)[0] * gate
         normal, gate = self.post_attention_layernorm(hidden, condition)
-        return hidden + self.mlp(normal) * gate
+        return hidden + self.mlp(normal) * gate, own.keys, own.values

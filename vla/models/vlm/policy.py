@@ -28,7 +28,7 @@ from vla.models.vlm.network import FlowNetwork, Prefix
 from vla.models.vlm.normalizer import Kind, Normalizer
 from vla.models.vlm.packed_linear import pack
 from vla.models.vlm.prompt import PADDING, WORDS, Prompt
-from vla.models.vlm.trunk import Trunk
+from vla.models.vlm.trunk import Trunk, sketch
 from vla.spec import Spec
 
 log = logging.getLogger(__name__)
@@ -100,7 +100,7 @@ class VisionLanguageAction(Model):
         require_prefix(prefix, self.execute, chunk)
         origin = None if trunk is None else Trunk(trunk)
         self.cameras = _cameras(cameras, spec, origin)
-        self.network = network() if origin is None else origin.build(network)
+        self.network = origin.build(network) if origin else _random(network)
         if self.text.name is None and self.network.vocabulary < WORDS:
             raise UserError(
                 f"model.network.vocabulary={self.network.vocabulary} is less than the {WORDS} words of a prompt "
@@ -241,6 +241,12 @@ def repeated(prefix: Prefix, copies: int) -> Prefix:
 def _require_width(what: str, components: int, width: int) -> None:
     if components > width:
         raise UserError(f"the {what} has {components} components, and model.network.{what}_width={width} are too few")
+
+
+def _random(network: Callable[[], FlowNetwork]) -> FlowNetwork:
+    """Build a network of random weights; a UserError, before any is drawn, if they need more memory than is free."""
+    sketch(network)
+    return network()
 
 
 def _cameras(named: dict[str, str | None] | None, spec: Spec, trunk: Trunk | None) -> list[str]:

@@ -16,12 +16,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from transformers import LlamaConfig, LlamaModel, SmolVLMConfig, SmolVLMModel
-from transformers.models.llama.modeling_llama import LlamaAttention, apply_rotary_pos_emb
+from transformers.models.llama.modeling_llama import LlamaAttention, LlamaDecoderLayer, apply_rotary_pos_emb
 
 from vla.io.errors import UserError
 from vla.io.types import Count, Inherited, Layers, Natural, Width
 from vla.models.vision.image_tokenizer import ImageEncoder, Keypoints
-from vla.models.vlm.network import FlowNetwork, Own, Prefix, Rotation, require_multiple, shorten, sizes, with_time
+from vla.models.vlm.network import FlowNetwork, Prefix, Rotation, WithKeys, require_multiple, shorten, sizes, with_time
 
 ROPE_BASE = 10_000.0  # of the policy, whatever that of the language model was
 EPSILON = 1e-5  # of RMS norms
@@ -72,6 +72,7 @@ class SmolVLA(FlowNetwork):
         require_multiple("heads", self.shared["num_attention_heads"], "key_heads", key_heads)
         require_multiple("resolution", self.resolution, "patch times shuffle", self.vision["patch_size"] * shuffle)
         self.state_width, self.joint_every, self.value_width = state_width, joint_every, key_heads * self.head_width
+        self.unused_width = self.width
         shared = {**self.shared, "num_key_value_heads": key_heads, "rms_norm_eps": EPSILON, **NO_TOKENS}
         self.vlm = _trunk({**shared, **self.text}, self.vision, shuffle)
         self.keypoints: KeypointTokens | None = None
@@ -113,9 +114,8 @@ class SmolVLA(FlowNetwork):
         mask[:, :, :-1, -1] = False  # only the state sees the state
         rotation, pairs = rotation_of(present.cumsum(1) - 1, self.head_width), []
         for layer, expert in zip(self.vlm.text_model.layers, self.expert.layers, strict=True):
-            own = Own()
-            hidden = layer(hidden, attention_mask=mask, position_embeddings=rotation, past_key_values=own)
-            pairs.append(expert.self_attn.read(own.keys, own.values))
+            hidden, *pair = layer(hidden, attention_mask=mask, position_embeddings=rotation)
+            pairs.append(pair if expert.self_attn.joint else expert(None, prefix=pair))
         return Prefix(tuple(keys for keys, _ in pairs), tuple(values for _, values in pairs), present)
 
     def _see(self, images: Tensor, read: Tensor, sentence: Tensor) -> Tensor:
@@ -171,6 +171,21 @@ class KeypointTokens(nn.Module):
         return self.tokens(self.keypoints(features)) + self.number
 
 
+class TrunkLayer(WithKeys, LlamaDecoderLayer):
+    """A layer of the trunk."""
+
+
+class ExpertLayer(LlamaDecoderLayer):
+    """A layer of the expert."""
+
+    def forward(self, hidden_states: Tensor | None, prefix: tuple[Tensor, Tensor], **attention: Any) -> Any:
+        """Return (B, k, F) tokens; or given none, what they are to attend to of the prefix: FSDP gathers the weights
+        of a layer for its `forward` only."""
+        if hidden_states is None:
+            return self.self_attn.read(*prefix)
+        return super().forward(hidden_states, prefix=prefix, **attention)
+
+
 class ExpertAttention(LlamaAttention):
     """Attention of actions to the prefix, and if it is `joint` to themselves, which have keys and values then."""
 
@@ -182,9 +197,7 @@ class ExpertAttention(LlamaAttention):
             self.k_proj, self.v_proj = (nn.Linear(width, width, bias=False) for _ in range(2))
 
     def read(self, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Return keys and values of the prefix, (B, heads, P, H) each, as `forward` takes them, given the trunk's."""
-        if self.joint:
-            return keys, values
+        """Return keys and values of the prefix, (B, heads, P, H) each, as `forward` takes them if it is not joint."""
         return self._by_head(self.k_proj(_flat(keys))), self._by_head(self.v_proj(_flat(values)))
 
     def forward(
@@ -213,7 +226,7 @@ def _trunk(text: dict[str, Any], vision: dict[str, Any], shuffle: int) -> SmolVL
     """Build vision_model, connector and text_model."""
     config = SmolVLMConfig(text_config={"model_type": "llama", **text}, vision_config=vision, scale_factor=shuffle)
     trunk = SmolVLMModel(config)
-    shorten(trunk.text_model)
+    shorten(trunk.text_model, TrunkLayer)
     return trunk
 
 
@@ -226,6 +239,7 @@ def _expert(shared: dict[str, Any], joint_every: int, hidden_size: int, intermed
     del expert.embed_tokens
     for number, layer in enumerate(expert.layers):
         layer.self_attn = ExpertAttention(config, number, joint=number % joint_every == 0)
+        layer.__class__ = ExpertLayer
     return expert
 
 

@@ -14,19 +14,22 @@ from vla.io.documents import parse_plain, read_json
 from vla.io.errors import UserError
 from vla.models.trunk import Source
 from vla.models.trunk_folder import CONFIG, WEIGHTS, opened, trunk_folder
-from vla.models.vlm.network import FlowNetwork, renamed
+from vla.models.vlm.network import MAX_PERIOD, MIN_PERIOD, FlowNetwork, renamed
 from vla.models.vlm.normalizer import MODES, Kind
-from vla.parallel.limits import memory
+from vla.parallel.limits import free_memory
 
 Part = TypeVar("Part")
 
 PREPROCESSOR = "policy_preprocessor.json"
 NORMALIZER = "normalizer_processor"  # its step
 IMAGES = "observation.images."
-# Options of LeRobot's policies that change what is computed → the only value that is known here.
-OPTIONS = {
-    **{"adapt_to_pi_aloha": False, "add_image_special_tokens": False, "attention_mode": "cross_attn"},
-    **{"num_expert_layers": -1, "prefix_length": -1, "use_relative_actions": False},
+KINDS = ("smolvla", "pi0", "pi05")  # of policies of LeRobot
+# Options of LeRobot's policies that change what is computed → the values that are known here. With 0 layers or less the
+# expert has those of the trunk, and with a length of 0 or less a prefix is not padded: smolvla_base has 0 for both.
+OPTIONS: dict[str, tuple[Any, ...]] = {
+    **{"adapt_to_pi_aloha": (False,), "add_image_special_tokens": (False,), "attention_mode": ("cross_attn",)},
+    **{"num_expert_layers": (-1, 0), "prefix_length": (-1, 0), "use_relative_actions": (False,)},
+    **{"min_period": (MIN_PERIOD,), "max_period": (MAX_PERIOD,)},
 }
 
 
@@ -44,9 +47,14 @@ class Trunk:
         self.name, self.folder = name, trunk_folder(name)
         self._config = read_json(self.folder / CONFIG, dict[str, Any])
         self.is_policy = "input_features" in self._config  # of LeRobot, and not the vision-language model alone
+        kind = self._config.get("type")
+        if self.is_policy and kind not in KINDS:
+            raise UserError(f"{name} is a policy of LeRobot's type {kind}: of {', '.join(KINDS)} there are models here")
         for option, known in OPTIONS.items():
-            if self._config.get(option, known) != known:
-                raise UserError(f"{name} was trained with {option}={self._config[option]}, and only {known} is known")
+            if self._config.get(option, known[0]) not in known:
+                raise UserError(
+                    f"{name} was trained with {option}={self._config[option]}, and only {known[0]} is known"
+                )
         self._files = sorted(self.folder.glob(WEIGHTS))
         if not self._files:
             raise UserError(f"{self.folder} has no weights, {WEIGHTS}: download the model again")
@@ -100,15 +108,10 @@ class Trunk:
         Parts whose weights are all from here have their `source` as an attribute.
 
         Raises:
-            UserError: a weight is missing, unknown or of another shape, or they need more than the memory.
+            UserError: a weight is missing, unknown or of another shape, or they need more memory than is free.
         """
-        with torch.device("meta"):
-            built = network()
+        built = sketch(network)
         own = dict(built.named_parameters())
-        if (needed := 4 * sum(weight.numel() for weight in own.values())) > memory():
-            raise UserError(
-                f"{self} needs {needed / 1e9:.1f} GB, and this machine has {memory() / 1e9:.1f} GB of memory"
-            )
         found = dict[str, Tensor]()
         for theirs, tensor in _tensors(self._files):
             name = renamed(theirs, built.published if self.is_policy else built.pretrained)
@@ -123,7 +126,8 @@ class Trunk:
                 raise UserError(f"{self} has {theirs}, which the model lacks: it has other parts, see model.network")
         parts = ("",) if self.is_policy else tuple(ours for _, ours in built.pretrained)
         if missing := [name for name in own if name not in found and name.startswith(parts)]:
-            raise UserError(f"{self} lacks {missing[0]} and {len(missing) - 1} other weights of the model")
+            more = ", …" if len(missing) > 1 else ""
+            raise UserError(f"{self} lacks weights of the model: {missing[0]}{more}")
         built.load_state_dict(found, strict=False, assign=True)
         materialize(built)
         source: Any = self.source
@@ -132,6 +136,19 @@ class Trunk:
             if names and found.keys() >= {*names}:
                 module.source = source
         return built
+
+
+def sketch(network: Callable[[], FlowNetwork]) -> FlowNetwork:
+    """Build a network without values, on the device "meta"; a UserError if its weights need more than is free."""
+    with torch.device("meta"):
+        built = network()
+    needed, free = sum(weight.nbytes for weight in built.parameters()), free_memory()
+    if needed > free:
+        raise UserError(
+            f"the weights of {type(built).__name__} need {needed / 1e9:.1f} GB of memory, and {free / 1e9:.1f} GB are "
+            "free: use a machine with more, or lower sizes in model.network"
+        )
+    return built
 
 
 def materialize(network: nn.Module) -> None:
