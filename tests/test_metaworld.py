@@ -7,19 +7,29 @@ import re
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
+import metaworld_client
+import metaworld_loops
+import mujoco
 import numpy as np
 import psutil
 import pytest
 from command_line import here
 from composing import composed
+from defaults import defaults_of
+from documented import ROOT
 from hydra.utils import instantiate
 from PIL import Image
 from replaying import played, same
+from saved_policies import save_policy
+from websockets.sync.client import connect
 
-from vla.config.experiment import Experiment
+from vla.api import load_policy
+from vla.config.experiment import Experiment, plain
 from vla.data.episodes import EpisodeStore
 from vla.deploy.client_observation import Keys
+from vla.deploy.server import PolicyServer, Service
 from vla.envs.lerobot import IMAGE, STATE, TASK, observations
 from vla.parallel.pool import THIS_PROCESS
 from vla.rollouts.collect import collect
@@ -210,6 +220,8 @@ def test_images_that_are_parts_of_a_picture_are_not_taken_from_whole_ones() -> N
         "task.cameras=[corner2,hand,topview]", "task.window=[0.25,0.29,0.95,0.99]", "task.image_size=[96,96]"
     ).spec
     assert spec.cut == ("corner2", "hand") and world("task.cameras=[corner2]").spec.cut == ()
+    whole_beside_hand = world("task.cameras=[corner2,hand]").spec
+    assert whole_beside_hand.given(["picture"]) == ["picture"] and whole_beside_hand.size("picture") == (480, 480)
     keys = Keys({"corner2": "image", "hand": "hand", "topview": "top"}, ["state"], "prompt")
     whole, part = np.zeros((480, 480, 3), np.uint8), np.zeros((96, 96, 3), np.uint8)
     sent = {"image": part, "hand": part, "top": whole, "state": np.zeros(4), "prompt": "Reach a goal position"}
@@ -250,11 +262,35 @@ def test_anybody_who_has_lerobots_picture_and_the_state_gives_the_images_of_the_
     picture = whole.rgb["corner2"].transpose(2, 0, 1)[None] / np.float32(255)
     (read,) = observations({IMAGE: picture, STATE: whole.state[None], TASK: [whole.instruction]}, spec)
     np.testing.assert_array_equal(spec.images(read)["hand"], own.rgb["hand"])
+    (read,) = observations({IMAGE: picture, STATE: whole.state[None], TASK: [whole.instruction]}, world().spec)
+    np.testing.assert_array_equal(read.rgb["corner2"], whole.rgb["corner2"])  # a policy with all of it
     given = {"picture": whole.rgb["corner2"], "state": whole.state, "instruction": "Reach a goal position"}
     assert {*Observation.from_mapping(given, spec).rgb} == {"picture"}
     with pytest.raises(ValueError, match=r'^the image "picture" must be \(H, W, 3\) uint8, and is float32 of \(480,'):
         spec.images(Observation({"picture": np.zeros((480, 480), np.float32)}, whole.state, ""))
     assert Spec.from_dict(spec.to_dict()) == spec
+
+
+def below_the_hand(state: Array) -> tuple[float, float]:
+    """Row and column of the point 75 mm below the hand in LeRobot's picture, by MuJoCo's camera."""
+    simulator = package.simulator("pick-place")
+    camera, axes = simulator.model.camera("corner2"), np.empty(9)
+    mujoco.mju_quat2Mat(axes, camera.quat)
+    across, up, behind = axes.reshape(3, 3).T @ (state[:3] - (0, 0, 0.075) - LEROBOT)
+    scale = 240 / np.tan(np.radians(camera.fovy[0] / 2)) / behind
+    simulator.close()
+    return 240 - scale * up, 240 + scale * across  # LeRobot turns the picture
+
+
+def test_the_hands_picture_is_the_part_of_lerobots_that_the_page_says(parts: Parts) -> None:
+    page = (ROOT / "docs/results/metaworld.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    for whole, own in parts[1]:
+        said: dict[str, Any] = {"np": np, "state": whole.state, "picture": whole.rgb["corner2"]}
+        exec(code, said)
+        np.testing.assert_array_equal(said["hand"], own.rgb["hand"])
+        middle = said["top"] + 48, said["left"] + 48
+        np.testing.assert_allclose(middle, below_the_hand(whole.state), atol=0.501)  # whole pixels
 
 
 def test_the_hands_picture_is_a_part_of_lerobots_that_moves_along(parts: Parts) -> None:
@@ -320,3 +356,26 @@ def test_it_is_collected_learnt_and_reported_by_tier(tmp_path: Path) -> None:
     assert report["per_episode"][1]["draws"]["object"]["height"] > 0
     page = (tmp_path / "run/report.html").read_text()
     assert "Success by tier of difficulty" in page and "mean over tiers" in page
+
+
+def test_a_client_plays_a_served_policy_on_lerobots_picture_and_is_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = ("model.width=16", "model.keypoints=4", "model.text_width=8", "task.tasks=[reach]", "task.steps=5")
+    config = composed("experiment=metaworld", *small)
+    asked = Experiment.of(config)
+    spec = asked.world().spec
+    run = save_policy(tmp_path / "run", plain(config), spec, state=asked.learner(spec).model.state_dict())
+    policy, folder = load_policy(run, device="cpu"), str(tmp_path / "played")
+    keys = Keys({"picture": "observation/image"}, ["observation/state"], "prompt")
+    made: dict[str, Any] = {"policy": lambda: policy, "environment": asked.make_environment(), "output": tmp_path}
+    server = PolicyServer(**defaults_of("deploy/server", port=0, keys=keys, api_key=None), **made)
+    monkeypatch.setattr(metaworld_client, "STEPS", 5)
+    with Service(server, policy).in_thread() as url:
+        with connect(url, compression=None, max_size=None) as socket:
+            assert metaworld_client.Server(socket).about["images"] == {"observation/image": [480, 480, 3]}
+        metaworld_client.main("1000000", "1", folder, "reach", url)
+    metaworld_loops.main(str(run), "1000000", folder)
+    printed = capsys.readouterr().out
+    assert re.search(r"^reach +0 of 1$", printed, re.MULTILINE)
+    assert "here: 0 of 1" in printed and "in LeRobot minus here: 0.0 points" in printed

@@ -128,6 +128,13 @@ class Spec:
         whole = self.parts and PICTURE in names
         return [PICTURE, *(name for name in self.cameras if name not in self.cut)] if whole else [*self.cameras]
 
+    def size(self, image: str) -> tuple[int, int]:
+        """Return height and width [px] in which an image to be given shows as much as those of training."""
+        if image != PICTURE or not self.parts:
+            return self.image_size
+        heights, widths = zip(*(part.whole(self.image_size) for part in self.parts), strict=True)
+        return max(heights), max(widths)
+
     def images(self, observation: Observation) -> Mapping[str, Array]:
         """Return camera → image, of which parts that are missing are cut out of the whole picture if it is there."""
         if PICTURE not in observation.rgb:

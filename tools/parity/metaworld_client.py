@@ -98,7 +98,7 @@ def main(seed: str, episodes: str, output: str, tasks: str = "", url: str = "ws:
             world = make_world(f"{task}-v3")
             successes = [play(world, server, sentences[task], int(seed) + index) for index in range(int(episodes))]
             world.close()
-            played.append({"task_group": task, "metrics": {"successes": successes}})
+            played.append({"task_group": f"{task}-v3", "metrics": {"successes": successes}})
             (Path(output) / "eval_info.json").write_text(json.dumps({"per_task": played}), encoding="utf-8")
             print(f"{task:28} {sum(successes)} of {episodes}", flush=True)
 

@@ -226,7 +226,7 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
     return {
         "server": "vla",
         "policy": type(policy.model).__name__,
-        "images": {key: [*spec.image_size, 3] for key in keys.cameras(spec).values()},
+        "images": {key: [*spec.size(camera), 3] for camera, key in keys.cameras(spec).items()},
         "state": {"keys": keys.state, "names": list(spec.state), "units": list(spec.state_units)},
         "prompt": keys.prompt,
         "action": {"names": list(spec.action), "units": list(spec.units), **bounds},

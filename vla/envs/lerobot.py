@@ -78,8 +78,9 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
     """Convert a batch of LeRobot's to observations.
 
     Args:
-        batch: `observation.images.CAMERA` (B, 3, H, W) from 0 to 1, or `observation.image`, of which cameras show
-            parts; `observation.state` and `observation.velocities` (B, …) arrays, and `task`, B instructions.
+        batch: `observation.images.CAMERA` (B, 3, H, W) from 0 to 1, or `observation.image`, the only camera's or the
+            one of which cameras show parts; `observation.state` and `observation.velocities` (B, …) arrays, and
+            `task`, B instructions.
         spec: of the policy.
 
     Raises:
@@ -87,7 +88,8 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
     """
     parts = _parts(spec)
     given = spec.given([PICTURE] if IMAGE in batch else [])
-    keys = {name: IMAGE if name == PICTURE else f"{IMAGES}{name}" for name in given}
+    single = given if IMAGE in batch and len(given) == 1 else []  # the only image of both
+    keys = {name: IMAGE if name in (PICTURE, *single) else f"{IMAGES}{name}" for name in given}
     needed = [*keys.values(), *parts, TASK]
     if missing := [key for key in needed if key not in batch]:
         raise UserError(f"the policy needs {', '.join(missing)}; there are {', '.join(map(str, batch))}")

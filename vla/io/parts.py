@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import ceil
 from typing import Annotated
 
 import numpy as np
@@ -50,6 +51,11 @@ class Part:
         size = window[2:] - window[:2]
         corner = (np.rint(self.pixels * corner) / self.pixels).clip(0, 1 - size)
         return np.concatenate([corner, corner + size])
+
+    def whole(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Return height and width [px] of the smallest picture that is as fine as the part in `size`."""
+        top, left, bottom, right = self.window
+        return max(self.pixels, ceil(size[0] / (bottom - top))), max(self.pixels, ceil(size[1] / (right - left)))
 
     def problems(self, cameras: Sequence[str], state: Sequence[str]) -> Iterator[str]:
         """Yield what contradicts itself, or the cameras and the state of a spec."""

@@ -98,8 +98,8 @@ def _located(model: Mapping[str, Any]) -> dict[str, Any]:
     """Return the node of a model with absolute names of folders of weights, which are found from any other folder."""
     located = copy.deepcopy({**model})
     for node, key in ((located, "trunk"), (located.get("text"), "name")):
-        if isinstance(node, dict) and node.get(key) and Path(node[key]).is_dir():
-            node[key] = str(Path(node[key]).resolve())
+        if isinstance(node, dict) and isinstance(name := node.get(key), str) and Path(name).is_dir():
+            node[key] = str(Path(name).resolve())
     return located
 
 

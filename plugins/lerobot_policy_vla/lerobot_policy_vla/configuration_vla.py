@@ -46,7 +46,8 @@ class VlaConfig(PreTrainedConfig):
         """
         spec = read_policy(checkpoint).spec
         vectors = {STATE: len(spec.pose), **({RATES: len(spec.rates)} if spec.rates else {})}
-        images = [*(f"{IMAGES}{name}" for name in spec.cameras), *([IMAGE] if spec.parts else [])]
+        single = [IMAGE] if spec.parts or len(spec.cameras) == 1 else []  # of an environment with one image
+        images = [*(f"{IMAGES}{name}" for name in spec.cameras), *single]
         self.input_features = {
             **{key: PolicyFeature(FeatureType.VISUAL, (3, *spec.image_size)) for key in images},
             **{key: PolicyFeature(FeatureType.STATE, (size,)) for key, size in vectors.items()},

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from vla.io.errors import UserError
-from vla.io.parts import Part, cut
+from vla.io.parts import WHOLE, Part, cut
 from vla.spec import Array, Spec
 from vla.tasks.metaworld.package import simulator, stop_sliding
 from vla.tasks.rendering.renderer import LazyRenderer, RendererFactory, Views
@@ -17,7 +17,7 @@ HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the optical axis, quaternion
 # LeRobot (src/lerobot/envs/metaworld.py) moves this camera, which hangs upside down, and turns its pictures.
 CAMERA, CAMERA_PLACE = "corner2", (0.75, 0.075, 0.7)  # [m]
 LEROBOT = 480  # height and width of its pictures [px]
-HAND = "hand"  # the part of CAMERA's picture around the fingertips, in place of a camera
+HAND = "hand"  # the part of CAMERA's picture around a point below the hand, in place of a camera
 MIDDLE = (0.0, 0.0, -0.075)  # of that part, 3 cm below the fingertips, from the position of the hand [m]
 PLACE = ("hand_x", "hand_y", "hand_z")  # of the hand, in the state
 FOVY = 60.0  # of CAMERA [degrees], and its orientation in every task before the turn, wxyz
@@ -91,9 +91,12 @@ class TaskScene:
 
 
 def parts_of(cameras: Sequence[str], window: Sequence[float] | None, hand_size: float) -> Iterator[Part]:
-    """Yield what cameras show of LeRobot's picture: CAMERA a window of it, if any, HAND the part around the hand."""
-    if window is not None and CAMERA in cameras:
-        yield Part(CAMERA, tuple(window))
+    """Yield what cameras show of LeRobot's picture: CAMERA a window or all of it, HAND the part around the hand.
+
+    Where CAMERA alone shows all of it, there are no parts.
+    """
+    if CAMERA in cameras and (window is not None or HAND in cameras):
+        yield Part(CAMERA, tuple(window or WHOLE))
     if HAND in cameras:
         half = hand_size / 2
         yield Part(HAND, (-half, -half, half, half), PLACE, MIDDLE, _projection(), LEROBOT)
