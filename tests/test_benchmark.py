@@ -18,9 +18,11 @@ from vla.models.model import Model
 from vla.parallel.limits import cores
 
 
-def test_an_evaluation_is_measured_of_a_trained_policy_only() -> None:
+def test_an_evaluation_without_a_trained_policy_is_refused_before_other_stages(tmp_path: Path) -> None:
+    asked = ("benchmark.names=[collect,evaluate]", f"output={tmp_path}/run", f"collect.folder={tmp_path}/episodes")
     with pytest.raises(UserError, match=r"plays a trained policy: add checkpoint=RUN"):
-        acting.evaluate(Experiment.of(composed("job=benchmark")))
+        run(Experiment.of(composed("job=benchmark", *asked)))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_measure_stands_beside_its_floor_and_the_machine() -> None:

@@ -35,6 +35,7 @@ from vla.tasks.tabletop.expert import Waypoint
 
 ROUNDS = ("job=improve", "pretrained=run", *SMALL, "task.time_limit=2", "evaluate.episodes=1")
 FEW = ("improve.episodes=2", "improve.steps=2", "collect.folder=few", "collect.episodes=3", "recorder=none")
+FEW += ("task.image_size=[40,48]", "cluster.policy=here")  # sharper cameras than in training, and one policy for all
 
 
 def label(folder: Path, workers: int, episodes: int = 12) -> EpisodeStore:

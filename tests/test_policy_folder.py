@@ -112,6 +112,9 @@ def test_a_policy_of_the_hub_is_read_from_its_cache(tmp_path: Path, monkeypatch:
     assert found.folder == snapshot
     found.restore(make_bc())
     assert found.training == read_policy(whole).training
+    link("config.json", "../../refs/v1")(snapshot)
+    with pytest.raises(ValueError, match="is a link that leaves the folder"):
+        read_policy(snapshot)
     for name, says in {
         "hub:somebody/lifter": "write hub:OWNER/NAME@REVISION",
         "hub:somebody/lifter@v2": "cannot be fetched from the Hugging Face hub: ",

@@ -162,6 +162,13 @@ def test_a_policy_behind_a_server_acts_as_it_does_from_its_checkpoint(home: Path
     assert len(first) == 2 and first == second
 
 
+def test_one_policy_for_all_workers_acts_as_one_beside_each(home: Path) -> None:
+    policy = ("checkpoint=run", "evaluate.episodes=2", "cluster.workers=1", "cluster.policy=here", "recorder=none")
+    here(home, *policy, "output=shared")
+    first, second = (json.loads((home / run / "report.json").read_text())["per_episode"] for run in ("run", "shared"))
+    assert len(first) == 2 and first == second
+
+
 def _listens(port: int) -> bool:
     try:
         create_connection(("127.0.0.1", port), 1).close()

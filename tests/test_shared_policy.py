@@ -25,6 +25,7 @@ from vla.rollouts.shared_policy import _accept, shared_policy
 from vla.spec import FIRST_SEED, Observation
 
 MODELS: dict[str, Callable[[], Model]] = {
+    "bc": partial(make_bc, chunk=2),
     "rt1": make_rt1,
     "act": partial(make_act, execute=2),
     "flow": partial(make_denoising, Flow),
@@ -32,12 +33,13 @@ MODELS: dict[str, Callable[[], Model]] = {
 SEEDS = range(FIRST_SEED, FIRST_SEED + 6)
 
 
-def test_reports_are_the_same_with_any_number_of_workers() -> None:
-    policy = as_policy(make_bc(chunk=2), lanes=2)
+@pytest.mark.parametrize(("name", "numbers"), [("bc", (1, 2, 4)), ("rt1", (4,)), ("act", (4,)), ("flow", (4,))])
+def test_reports_are_the_same_with_any_number_of_workers(name: str, numbers: tuple[int, ...]) -> None:
+    policy = as_policy(MODELS[name](), lanes=2)
     beside = evaluate(Telling, lambda world: policy, None, SEEDS)
     with shared_policy(lambda: policy) as agent:
-        reports = [evaluate(Telling, agent, None, SEEDS, Cluster(workers, "beside")) for workers in (1, 2, 4)]
-    assert not beside.errors and reports == [beside] * 3
+        reports = [evaluate(Telling, agent, None, SEEDS, Cluster(workers, "beside")) for workers in numbers]
+    assert not beside.errors and reports == [beside] * len(numbers)
 
 
 @pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())

@@ -24,6 +24,7 @@ from vla.deploy.inference import Inference
 from vla.io.images import resize
 from vla.io.parts import Part
 from vla.models import transforms
+from vla.models.layers import Batch
 from vla.models.model import Model
 from vla.models.transforms import Fit
 
@@ -54,10 +55,17 @@ def test_any_size_is_taken_and_the_size_itself_is_left_alone(fit: Fit) -> None:
     assert transforms.resized(images, (96, 64), fit) is images
 
 
-def test_what_importers_store_is_what_a_policy_makes_of_the_same_picture() -> None:
-    image = np.random.default_rng(0).integers(256, size=(90, 120, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(resized(image, (48, 48), "crop"), resize(image, (48, 48)))
-    assert resize(image, (90, 120)) is image
+@pytest.mark.parametrize("fit", FITS)
+def test_what_importers_store_is_what_a_policy_makes_of_the_same_picture(fit: Fit) -> None:
+    image = np.random.default_rng(0).integers(256, size=(90, 160, 3), dtype=np.uint8)
+    for size in (None, (20, 20)):
+        model, rest = make_bc(spec=TRAINED, image_size=size, fit=fit), {"text": torch.zeros(1, 1)}
+        raw, stored = (
+            model.transforms({"rgb": {"eye": torch.from_numpy(each)[None, None]}, **rest})["rgb"]["eye"]
+            for each in (image, resize(image, TRAINED.image_size))
+        )
+        assert raw.shape[2:4] == (size or TRAINED.image_size) and torch.equal(raw, stored)
+    assert resize(image, (90, 160)) is image
 
 
 def test_every_pixel_counts() -> None:
@@ -111,6 +119,13 @@ def test_one_raw_observation_is_the_same_input_everywhere(
 
     encoder: Any = model.features.images[0] if make is make_bc else model.context.image  # type: ignore[union-attr]
     encoder.register_forward_pre_hook(keep)
+    made, transform = list[Batch](), model.transforms
+
+    def transformed(batch: Batch) -> Batch:
+        made.append(transform(batch))
+        return made[-1]
+
+    model.transforms = transformed  # type: ignore[assignment]
     seen = raw_world().reset(0)
     for path in (
         lambda: in_training(model, store),
@@ -123,6 +138,9 @@ def test_one_raw_observation_is_the_same_input_everywhere(
     assert inputs[0][0].shape == (1, 3, 20, 20) and inputs[0][0].std() > 0.01
     for others in inputs[1:]:  # validation computes loss and prediction, each of which looks once
         assert all(torch.equal(*pair) for pair in zip(inputs[0][:2], others, strict=True))
+    assert len(made) == 4
+    for name in ("state", "text"):
+        assert all(torch.equal(made[0][name], other[name]) for other in made)
 
 
 def test_a_world_with_another_size_of_images_fits_unless_they_are_cut_out() -> None:

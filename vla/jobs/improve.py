@@ -102,8 +102,7 @@ def _require_possible(experiment: Experiment) -> range:
         close_agent(expert)
         require_memoryless(expert)
         if (policy := experiment.pretrained) is not None:
-            known = read_policy(policy).spec.without_truth
-            known.require(environment.spec.without_truth, f"the checkpoint {policy}", "the task")
+            read_policy(policy).spec.require_input(environment.spec, f"the checkpoint {policy}", "the task")
         with closing(experiment.make_environment(asked.changes)()) as changed:
             environment.spec.require(changed.spec, "the task", "the task with improve.changes")
             with changed.blind():

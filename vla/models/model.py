@@ -57,7 +57,7 @@ class Model(nn.Module, ABC):
         shift: largest random shift of the training images, vertical and horizontal [1/256 of the image height]; one
             offset for all frames of a window.
         image_size: height and width of the images that the model sees [px]; None: those of the demonstrations.
-        fit: of images with another aspect ratio: crop the centre, pad with black borders, or stretch.
+        fit: for an `image_size` of another aspect ratio: crop the centre, pad with black borders, or stretch.
         spec: observation and action spaces.
         tokenizer: converts between actions and tokens, and gives the action bounds.
 
@@ -92,9 +92,9 @@ class Model(nn.Module, ABC):
             raise UserError(f"model.execute={execute} is more than the model.chunk={chunk} actions that are predicted")
         self.width, self.spec, self.tokenizer = width, spec, tokenizer
         self.text = text(width=text_width)
-        sizes = [spec.image_size, *([image_size] if image_size else [])]
-        self.image_size = sizes[-1]
-        self.transforms = Transforms(tuple((size[0], size[1]) for size in sizes), fit, self.text.tokenize)
+        self.image_size = image_size or spec.image_size
+        demonstrations, size = ((each[0], each[1]) for each in (spec.image_size, self.image_size))
+        self.transforms = Transforms(demonstrations, size, fit, self.text.tokenize)
         self.shift = RandomShift(*shift)
         self.robot_state = RobotState(spec)
         self.add_truth_head(width, auxiliary)

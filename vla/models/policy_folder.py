@@ -190,7 +190,8 @@ def _file(folder: Path, name: str) -> Path:
         UserError: there is none, or it is a link out of the folder; those of the hub's cache lead to its blobs.
     """
     path, root = folder / name, folder.resolve()
-    if not path.resolve().is_relative_to(root.parents[1] if root.parent.name == "snapshots" else root):
+    blobs = root.parents[1] / "blobs" if root.parent.name == "snapshots" else root
+    if not any(path.resolve().is_relative_to(place) for place in (root, blobs)):
         raise UserError(f"{path} is a link that leaves the folder: copy the policy from where it is whole")
     if not path.is_file():
         raise UserError(f"{folder} has no {name}: copy the policy from where it is whole")

@@ -22,20 +22,22 @@ class Transforms:
     did. The model itself normalises numbers, by statistics saved with its weights. Absent frames of a window are zero.
 
     Args:
-        sizes: height and width of the images of every camera, one after the other [px].
-        fit: for another aspect ratio, "crop" to the centre, "pad" with black borders, or "stretch".
+        demonstrations: height and width of their images, to which importers have cropped them [px].
+        size: those of the images that the model sees [px].
+        fit: of these, for another aspect ratio: "crop" to the centre, "pad" with black borders, or "stretch".
         tokenize: sentences → tokens.
     """
 
-    sizes: tuple[tuple[int, int], ...]
+    demonstrations: tuple[int, int]
+    size: tuple[int, int]
     fit: Fit
     tokenize: Callable[[list[str]], Tensor]
 
     def __call__(self, batch: Batch) -> Batch:
         """Return the input of a model: its images have `image_size`, and "text" is there, made of "instruction"."""
-        rgb = dict(batch["rgb"])
-        for size in self.sizes:
-            rgb = {camera: resized(images, size, self.fit) for camera, images in rgb.items()}
+        # Cropped whatever `fit` is, as importers do, who know no model: so a robot's camera shows what they stored.
+        rgb = {camera: resized(images, self.demonstrations, "crop") for camera, images in batch["rgb"].items()}
+        rgb = {camera: resized(images, self.size, self.fit) for camera, images in rgb.items()}
         text = batch["text"] if "text" in batch else self.tokenize(batch["instruction"]).to(batch["state"].device)
         return {**batch, "rgb": rgb, "text": text}
 

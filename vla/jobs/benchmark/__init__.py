@@ -11,6 +11,7 @@ from importlib import import_module
 
 from vla.config.experiment import Experiment
 from vla.config.nodes import Benchmark
+from vla.io.errors import UserError
 from vla.io.files import write_json
 from vla.io.printable import show
 from vla.jobs.benchmark.measure import Measure, machine, other_load
@@ -25,12 +26,15 @@ MODULES = dict.fromkeys(("policy", "evaluate"), "acting")  # others are named li
 def run(experiment: Experiment) -> dict[str, Measure]:
     """Measure the stages in `benchmark.names`, print a table and write `benchmark.json`; returns name → measure.
 
-    Both name the processor, and how many of its cores other programs used during a stage.
+    Both name the processor, and how many of its cores other programs used during a stage. There is a UserError if there
+    is no policy to evaluate.
     """
     from vla.reports.tables import Table  # imports matplotlib
 
-    here, found = machine(), dict[str, Measure]()
-    for name in experiment.options(Benchmark).names:
+    here, found, names = machine(), dict[str, Measure](), experiment.options(Benchmark).names
+    if "evaluate" in names and experiment.checkpoint is None:  # before the others, which take minutes
+        raise UserError("benchmark.names=[evaluate] plays a trained policy: add checkpoint=RUN")
+    for name in names:
         stage, (others, began) = getattr(import_module(f"{__name__}.{MODULES.get(name, name)}"), name), other_load()
         measured, (others_now, now) = stage(experiment), other_load()
         used = max(0.0, others_now - others) / max(now - began, 1e-9)

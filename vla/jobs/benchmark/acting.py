@@ -62,8 +62,6 @@ def _require_equal(theirs: Tensor, ours: Tensor) -> None:
 
 def evaluate(experiment: Experiment) -> dict[str, Measure]:
     """Measure `job=evaluate` with every recording, in episodes per second; the floor is the same without recordings."""
-    if experiment.checkpoint is None:
-        raise UserError("benchmark.names=[evaluate] plays a trained policy: add checkpoint=RUN")
     count, rates = experiment.options(Benchmark).episodes, []
     for recorder in (plain(compose().recorder), None):
         with TemporaryDirectory() as folder:
