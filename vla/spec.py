@@ -294,7 +294,7 @@ class Environment(Protocol):
         events: (step, description) of what the agent did not cause, such as disturbances; recordings mark them,
         instructions, completed: number of instructions of the current episode, each given when the one before is
             completed, and how many are; it succeeds when all are, and fails as soon as one does,
-        period: number of seeds from `FIRST_SEED` on after which episodes are the same again, None for never.
+        benchmark: number of seeds from `FIRST_SEED` on that are the episodes of a published benchmark, or None.
     """
 
     spec: Spec

@@ -238,8 +238,8 @@ def require_possible(experiment: Experiment) -> None:
         raise UserError("evaluate.conditions change a world, and a recording has none: omit them")
     if wanted.nearest is not None:
         open_memory(Path(wanted.nearest), None, experiment.world().spec)
-    if hasattr(experiment.kind("task"), "period"):
-        _require_different(experiment.world(), wanted)
+    if hasattr(experiment.kind("task"), "benchmark"):
+        _require_benchmark(experiment.world(), wanted)
     output = Path(settings.output)  # not created yet
     if settings.job != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
         raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
@@ -253,13 +253,13 @@ def require_possible(experiment: Experiment) -> None:
             raise UserError(f"condition {name} of the evaluation: {error}") from error
 
 
-def _require_different(world: Any, wanted: Evaluation) -> None:
-    """Raise a UserError if episodes are the same again, which would count as further ones."""
-    period: int | None = world.period
-    if wanted.seed >= FIRST_SEED and period is not None and wanted.episodes > period:
+def _require_benchmark(world: Any, wanted: Evaluation) -> None:
+    """Raise a UserError if an evaluation goes beyond the episodes of a benchmark."""
+    count: int | None = world.benchmark
+    if count is not None and wanted.seed < FIRST_SEED + count < wanted.seed + wanted.episodes:
         raise UserError(
-            f"evaluate.episodes={wanted.episodes}: there are {period} different ones, and no interval may count one "
-            f"twice: set evaluate.episodes={period}"
+            f"evaluate.episodes={wanted.episodes}: the benchmark has {count} episodes, and others start elsewhere: "
+            f"set evaluate.episodes={FIRST_SEED + count - wanted.seed}, or evaluate.seed={FIRST_SEED + count}"
         )
 
 

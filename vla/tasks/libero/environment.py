@@ -70,8 +70,8 @@ class Libero(ManyTasks):
             cameras: names of cameras, such as "agentview" and "robot0_eye_in_hand".
             mirror: whether images are mirrored left to right, as those are that published policies were trained with.
             detail: of meshes and textures.
-            starts: "by_seed": the fifty states of the benchmark for the seeds of evaluations, and for all others states
-                that are drawn from the same regions; "drawn": always these.
+            starts: "by_seed": the fifty states of the benchmark for as many seeds of every task from `FIRST_SEED` on,
+                and for all others states that are drawn from the same regions; "drawn": always these.
             randomize: what else differs between drawn starts.
             steps: whose limits of an episode's steps.
             settle: steps before the first observation, in which things come to rest.
@@ -104,8 +104,8 @@ class Libero(ManyTasks):
         )
 
     @property
-    def period(self) -> int | None:
-        """Number of seeds of evaluations after which the official states come again; None without these."""
+    def benchmark(self) -> int | None:
+        """Number of seeds from `FIRST_SEED` on that start in the official states; None without these."""
         return STATES * len(self._tasks) if self._starts_of == "by_seed" else None
 
     @property
@@ -120,8 +120,8 @@ class Libero(ManyTasks):
         self.task, self.done, self.outcome, self._taken = task.name, False, "timeout", 0
         scene = self._scene = self._scene_of(task.scene, lambda: Scene(task, self._renderer, self.spec, self._detail))
         starts, self._goal = scene.started(task)
-        turn = (seed - FIRST_SEED) // len(self._tasks)
-        state = turn % len(starts) if self._starts_of == "by_seed" and seed >= FIRST_SEED else None
+        turn = seed - FIRST_SEED
+        state = turn // len(self._tasks) if 0 <= turn < (self.benchmark or 0) else None
         # Each its own, so that one share changes nothing but what it is of.
         random, places, colours = (np.random.default_rng(key) for key in (seed, [seed, 4], [seed, 5]))
         exchanged = state is None and places.random() < self._randomize.places
