@@ -83,7 +83,7 @@ def test_what_is_exported_has_every_name_that_is_published(name: str, tmp_path: 
     """Otherwise LeRobot's classes say that it could not be loaded."""
     export(name, tmp_path)
     written, head = load_file(tmp_path / "exported/model.safetensors"), "paligemma_with_expert.gemma_expert.lm_head."
-    ours = {weight: tensor for weight, tensor in published(make_network(name))}
+    ours = dict(published(make_network(name)))
     assert written.keys() == {f"model.{weight}" for weight in (*ours, f"{head}weight")}
     assert written[f"model.{head}weight"].shape == (SIZES["vocabulary"], SIZES["expert_width"])
     assert all(torch.equal(written[f"model.{weight}"], tensor) for weight, tensor in ours.items())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import SMALL, here
-from defaults import defaults_of
+from defaults import defaults_of, part_of
 from fake_batch import as_policy, make_batch, overfit, with_text
 from safetensors.torch import load_file, save_file
 from saved_policies import change_json
@@ -40,7 +41,10 @@ from toy_episodes import full_disk
 from vla.io.errors import UserError
 from vla.models.learner import Learner
 from vla.models.lora import LoRA
+from vla.models.packaged import PackagedFile
 from vla.models.policy_folder import read_policy
+from vla.models.trunk_folder import is_trunk
+from vla.models.vision.timm_encoders import FilmEfficientNet
 from vla.models.vlm.lerobot_export import LeRobotPolicyExporter
 from vla.models.vlm.normalizer import Normalizer
 from vla.models.vlm.policy import resize_with_padding
@@ -306,14 +310,20 @@ def test_factors_beside_published_weights_are_in_the_policy(frozen: list[str], t
         assert lost < 2e-6 < 1e-3 < learned
 
 
-def test_a_trunk_alone_leaves_the_expert_random(tmp_path: Path) -> None:
-    folder = tmp_path / "trunk"
+def write_trunk(folder: Path) -> dict[str, torch.Tensor]:
+    """Write a vision-language model alone, and return its weights."""
     folder.mkdir()
     (folder / "config.json").write_text('{"model_type": "smolvlm"}')
     state = make_smolvla().network.state_dict().items()
     weights = {f"model.{name.removeprefix('vlm.')}": weight for name, weight in state if name.startswith("vlm.")}
     further = {"model.text_model.layers.31.mlp.up_proj.weight": torch.zeros(2), "lm_head.weight": torch.zeros(2)}
     save_file({**weights, **further}, folder / "model.safetensors")
+    return weights
+
+
+def test_a_trunk_alone_leaves_the_expert_random(tmp_path: Path) -> None:
+    folder = tmp_path / "trunk"
+    weights = write_trunk(folder)
     torch.manual_seed(0)
     model = make_smolvla(trunk=str(folder))
     found = model.network.state_dict()
@@ -344,7 +354,7 @@ def test_other_weights_are_refused(tmp_path: Path, tokenizer: Path, change: Any,
     [
         ({"num_expert_layers": 8}, "was trained with num_expert_layers=8, and only -1 is known"),
         ({"max_period": 2.0}, r"was trained with max_period=2\.0, and only 4\.0 is known"),
-        ({"type": "act"}, "is a policy of LeRobot's type act: of smolvla, pi0, pi05 there are models here"),
+        ({"type": "act"}, "is a policy of LeRobot's type act, and only smolvla, pi0, pi05 are known"),
     ],
 )
 def test_policies_of_other_options_and_types_are_refused(
@@ -372,6 +382,19 @@ def test_a_network_larger_than_the_free_memory_is_refused_before_it_is_built(
     monkeypatch.setattr("vla.models.vlm.trunk.free_memory", lambda: 1000)
     with pytest.raises(UserError, match=r"SmolVLA need .* GB of memory, and 0\.0 GB are free: use a machine with more"):
         make_smolvla(tokenizer, trunk=folder and str(folder))
+
+
+def test_a_pretrained_image_encoder_keeps_its_weights_beside_a_trunk(tmp_path: Path) -> None:
+    weights = PackagedFile(**part_of("model/image/film_efficientnet_lite0", "pretrained"))
+    image = partial(FilmEfficientNet, **defaults_of("model/image/film_efficientnet_lite0", pretrained=weights))
+    network = partial(SmolVLA, **{**SMOLVLA, "vocabulary": WORDS, "keypoints": 4, "image": image})
+    write_trunk(tmp_path / "trunk")
+    with warnings.catch_warnings(action="error"):
+        make_smolvla(network=network)
+        model = make_smolvla(network=network, trunk=str(tmp_path / "trunk"))
+    blocks = image(text_width=SMOLVLA["width"]).blocks.state_dict()
+    kept = model.network.state_dict()
+    assert blocks and all(torch.equal(kept[f"keypoints.encoder.blocks.{name}"], blocks[name]) for name in blocks)
 
 
 def test_a_normaliser_without_the_action_and_a_camera_without_counterpart_are_refused(
@@ -410,6 +433,11 @@ def test_a_normaliser_without_the_action_and_a_camera_without_counterpart_are_re
 def test_a_trunk_that_is_not_there_and_a_tokenizer_that_is_not_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is no folder with pretrained weights"):
         make_smolvla(trunk=str(tmp_path / "nothing"))
+    with pytest.raises(UserError, match=r"there is no policy and no download '.*nothing': name a run"):
+        is_trunk(str(tmp_path / "nothing"))
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(UserError, match="has neither model_type nor input_features: download the model again"):
+        is_trunk(str(tmp_path))
     with pytest.raises(UserError, match="cannot be fetched from the Hugging Face hub"):
         make_smolvla(trunk="hub:nobody/nothing")
     with pytest.raises(UserError, match="cannot be fetched from the Hugging Face hub"):

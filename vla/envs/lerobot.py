@@ -88,7 +88,7 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
     """
     parts = _parts(spec)
     given = spec.given([PICTURE] if IMAGE in batch else [])
-    single = given if IMAGE in batch and len(given) == 1 else []  # the only image of both
+    single = given if IMAGE in batch and len(given) == 1 else []  # of the batch and of the policy
     keys = {name: IMAGE if name in (PICTURE, *single) else f"{IMAGES}{name}" for name in given}
     needed = [*keys.values(), *parts, TASK]
     if missing := [key for key in needed if key not in batch]:

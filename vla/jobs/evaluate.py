@@ -54,7 +54,7 @@ from vla.runs.folder import (
 from vla.runs.played import Played
 from vla.runs.resume import cached_success
 from vla.schedule import Delays
-from vla.spec import FIRST_SEED, IN_DISTRIBUTION, Multitask
+from vla.spec import IN_DISTRIBUTION, Multitask
 
 log = logging.getLogger(__name__)
 
@@ -238,8 +238,6 @@ def require_possible(experiment: Experiment) -> None:
         raise UserError("evaluate.conditions change a world, and a recording has none: omit them")
     if wanted.nearest is not None:
         open_memory(Path(wanted.nearest), None, experiment.world().spec)
-    if hasattr(experiment.kind("task"), "benchmark"):
-        _require_benchmark(experiment.world(), wanted)
     output = Path(settings.output)  # not created yet
     if settings.job != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
         raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
@@ -251,15 +249,20 @@ def require_possible(experiment: Experiment) -> None:
                 world.reset(wanted.seed)  # such as with more blocks than colours
         except ValueError as error:
             raise UserError(f"condition {name} of the evaluation: {error}") from error
+    if hasattr(experiment.kind("task"), "benchmark"):
+        for name, changes in {IN_DISTRIBUTION: {}, **wanted.changes}.items():
+            with closing(experiment.make_environment(changes)()) as world:
+                _require_benchmark(name, world, wanted)
 
 
-def _require_benchmark(world: Any, wanted: Evaluation) -> None:
-    """Raise a UserError if an evaluation goes beyond the episodes of a benchmark."""
+def _require_benchmark(condition: str, world: Any, wanted: Evaluation) -> None:
+    """Raise a UserError if an evaluation would play an episode of a benchmark twice in the world of a condition."""
     count: int | None = world.benchmark
-    if count is not None and wanted.seed < FIRST_SEED + count < wanted.seed + wanted.episodes:
+    if count is not None and wanted.episodes > count:
+        where = "" if condition == IN_DISTRIBUTION else f" in the condition {condition}"
         raise UserError(
-            f"evaluate.episodes={wanted.episodes}: the benchmark has {count} episodes, and others start elsewhere: "
-            f"set evaluate.episodes={FIRST_SEED + count - wanted.seed}, or evaluate.seed={FIRST_SEED + count}"
+            f"evaluate.episodes={wanted.episodes}: the benchmark has {count} episodes{where}, and no interval may "
+            f"count one twice: set evaluate.episodes={count}"
         )
 
 

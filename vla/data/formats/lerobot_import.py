@@ -110,7 +110,7 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         """Describe a dataset, see `ImportedDemonstrations.recording`."""
         dataset = _opened(folder, images)
         if not dataset.images:
-            raise UserError(f"{dataset.folder} has no images, and policies see: record it with a camera")
+            raise UserError(f"{dataset.folder} has no images, which policies need: record it with a camera")
         states, actions = dataset.components(state), dataset.components(action)
         values, factors = dataset.read(action), _factors(scale, [*actions])
         places = zip(actions.items(), factors, strict=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,6 +15,7 @@ from vla.io.documents import parse_plain, read_json
 from vla.io.errors import UserError
 from vla.models.trunk import Source
 from vla.models.trunk_folder import CONFIG, WEIGHTS, opened, trunk_folder
+from vla.models.vision.image_tokenizer import ImageEncoder
 from vla.models.vlm.network import MAX_PERIOD, MIN_PERIOD, FlowNetwork, renamed
 from vla.models.vlm.normalizer import MODES, Kind
 from vla.parallel.limits import free_memory
@@ -49,7 +51,7 @@ class Trunk:
         self.is_policy = "input_features" in self._config  # of LeRobot, and not the vision-language model alone
         kind = self._config.get("type")
         if self.is_policy and kind not in KINDS:
-            raise UserError(f"{name} is a policy of LeRobot's type {kind}: of {', '.join(KINDS)} there are models here")
+            raise UserError(f"{name} is a policy of LeRobot's type {kind}, and only {', '.join(KINDS)} are known")
         for option, known in OPTIONS.items():
             if self._config.get(option, known[0]) not in known:
                 raise UserError(
@@ -111,6 +113,8 @@ class Trunk:
             UserError: a weight is missing, unknown or of another shape, or they need more memory than is free.
         """
         built = sketch(network)
+        if any(isinstance(module, ImageEncoder) for module in built.modules()):
+            built = network()  # such an encoder is small, and may have weights of its own, which a sketch lacks
         own = dict(built.named_parameters())
         found = dict[str, Tensor]()
         for theirs, tensor in _tensors(self._files):
@@ -140,7 +144,8 @@ class Trunk:
 
 def sketch(network: Callable[[], FlowNetwork]) -> FlowNetwork:
     """Build a network without values, on the device "meta"; a UserError if its weights need more than is free."""
-    with torch.device("meta"):
+    # Warnings of an image encoder's own weights, of which a sketch takes the shapes only.
+    with torch.device("meta"), warnings.catch_warnings(action="ignore"):
         built = network()
     needed, free = sum(weight.nbytes for weight in built.parameters()), free_memory()
     if needed > free:

@@ -29,6 +29,7 @@ STEPS = {
     "openpi": {"spatial": 220, "object": 280, "goal": 300, "long": 520},
 }
 WAIT = np.array([0.0] * 6 + [-1.0])  # the command while things settle: stay, and open the gripper
+END = 2 * FIRST_SEED  # of the seeds with official states; those that select weights come after it
 TINTED = 0.5  # share of the things with another colour, in starts that have such things
 TINT = 0.2, 1.0  # range of the factors of red, green and blue
 
@@ -70,8 +71,8 @@ class Libero(ManyTasks):
             cameras: names of cameras, such as "agentview" and "robot0_eye_in_hand".
             mirror: whether images are mirrored left to right, as those are that published policies were trained with.
             detail: of meshes and textures.
-            starts: "by_seed": the fifty states of the benchmark for as many seeds of every task from `FIRST_SEED` on,
-                and for all others states that are drawn from the same regions; "drawn": always these.
+            starts: "by_seed": the fifty states of the benchmark for seeds from `FIRST_SEED` to before `END`, for others
+                states that are drawn from the same regions; "drawn": always these.
             randomize: what else differs between drawn starts.
             steps: whose limits of an episode's steps.
             settle: steps before the first observation, in which things come to rest.
@@ -105,7 +106,7 @@ class Libero(ManyTasks):
 
     @property
     def benchmark(self) -> int | None:
-        """Number of seeds from `FIRST_SEED` on that start in the official states; None without these."""
+        """Number of seeds after which the official states come again; None without these."""
         return STATES * len(self._tasks) if self._starts_of == "by_seed" else None
 
     @property
@@ -120,8 +121,8 @@ class Libero(ManyTasks):
         self.task, self.done, self.outcome, self._taken = task.name, False, "timeout", 0
         scene = self._scene = self._scene_of(task.scene, lambda: Scene(task, self._renderer, self.spec, self._detail))
         starts, self._goal = scene.started(task)
-        turn = seed - FIRST_SEED
-        state = turn // len(self._tasks) if 0 <= turn < (self.benchmark or 0) else None
+        official = self._starts_of == "by_seed" and FIRST_SEED <= seed < END
+        state = (seed - FIRST_SEED) // len(self._tasks) % STATES if official else None
         # Each its own, so that one share changes nothing but what it is of.
         random, places, colours = (np.random.default_rng(key) for key in (seed, [seed, 4], [seed, 5]))
         exchanged = state is None and places.random() < self._randomize.places

@@ -62,9 +62,6 @@ class Starts:
         self._owners = {part[1]: part[2] for part in task.initial if part[0] in ("on", "in")}
         self._exchangeable = [thing for thing in self._owners if self._may_move(thing)]
 
-    def __len__(self) -> int:
-        return len(self._states)
-
     def official(self, number: int) -> Start:
         """Return an official start, with the fixtures as the scene was made; they are not in its state."""
         poses = {
