@@ -272,6 +272,16 @@ def test_actions_can_have_other_units_and_steps_another_rate(home: Path) -> None
         demonstrations(home / "dataset", ARM_SPEC, scale={"z": 2.0})
 
 
+def test_a_dataset_without_images_is_refused_as_such(home: Path, tmp_path: Path) -> None:
+    def without_images(content: Any) -> None:
+        features = content["features"].items()
+        content["features"] = {name: each for name, each in features if each["dtype"] not in ("image", "video")}
+
+    dataset = changed(home, tmp_path / "dataset", info(without_images))
+    with pytest.raises(UserError, match=r"dataset has no images, which policies need: record it with a camera"):
+        recording(dataset)
+
+
 def test_every_step_has_the_instruction_of_its_task(home: Path, tmp_path: Path, caplog: Any) -> None:
     def from_fourth(table: pa.Table) -> Any:
         return (np.array(table["frame_index"]) >= 4) & (np.array(table["episode_index"]) < 2)

@@ -186,11 +186,11 @@ def test_no_official_state_counts_twice() -> None:
     def of_goal(*overrides: str) -> Experiment:
         return Experiment.of(composed("experiment=libero", *PLAIN, "task.suite=goal", *overrides))
 
-    with pytest.raises(UserError, match=r"evaluate\.episodes=2000: the benchmark has 500 episodes, .*episodes=500$"):
+    with pytest.raises(UserError, match=r"evaluate\.episodes=2000: there are 500 different ones, .*episodes=500$"):
         require_possible(of_goal())
     require_possible(of_goal("evaluate.episodes=500"))
-    require_possible(of_goal("task.starts=drawn"))
-    with pytest.raises(UserError, match="the benchmark has 50 episodes in the condition one, "):
+    require_possible(of_goal("evaluate.seed=2000000"))  # drawn starts
+    with pytest.raises(UserError, match="there are 50 different ones in the condition one, "):
         require_possible(of_goal("evaluate.episodes=500", "+evaluate.conditions.one={tasks: [0]}"))
 
 
@@ -373,7 +373,6 @@ def test_the_truth_is_of_what_is_next() -> None:
     [
         (["libero"], "LIBERO has no suite 'libero': it has spatial, object, goal, long, and LIBERO-PRO"),
         (["goal", "task.cameras=[wrist]"], "task.cameras names wrist; LIBERO has"),
-        (["goal", "task.starts=official"], "task.starts must be 'by_seed' or 'drawn', got 'official'"),
     ],
 )
 def test_bad_options_end_in_a_sentence(overrides: list[str], message: str) -> None:

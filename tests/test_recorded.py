@@ -32,7 +32,7 @@ from vla.deploy.client_observation import Keys
 from vla.deploy.control_loop import ControlLoop
 from vla.io.images import resize
 from vla.models.policy_folder import read_policy
-from vla.reports.open_loop import components
+from vla.reports.open_loop import components, errors_table
 from vla.robots.controllers import controller_for
 from vla.rollouts.open_loop import open_loop
 from vla.rollouts.statistics import mean_interval
@@ -329,6 +329,15 @@ def test_errors_are_means_over_recordings_with_an_interval() -> None:
     np.testing.assert_allclose(split.mean, [3] * 3, rtol=1e-5)
     np.testing.assert_allclose(split.interval[1], [3 + 12.7062] * 3, rtol=1e-4)
     assert split.relative == pytest.approx(float((split.mean / split.constant_errors).mean()))
+
+
+def test_units_are_tabulated_where_there_are_some() -> None:
+    with_units, without = (
+        errors_table(components(open_loop(Behind(), spec, [episode(0)], np.zeros(3))), 1)
+        for spec in (SPEC, replace(SPEC, units=("1",) * 3))
+    )
+    assert "unit" in with_units.heads and "deg" in with_units.rows[0]
+    assert "unit" not in without.heads and {len(row) for row in without.rows} == {len(without.heads)}
 
 
 JOINTS = replace(ROBOT, joints=["a", "b", "c"], low=[-1.5] * 3, high=[1.5] * 3, speed=[2.0] * 3,

@@ -24,6 +24,7 @@ from small_training import CONFIG
 from tiny_pi import KINDS, make_policy
 from tiny_vla import deviation, make_smolvla
 from torch.distributed.device_mesh import init_device_mesh
+from torch.distributed.fsdp import FSDPModule
 from trunk import make_trunk_model
 
 from vla.config.experiment import Experiment
@@ -126,6 +127,7 @@ def share_vlas(store: Path, folder: Path) -> None:
         whole = copy.deepcopy(model)
         with patch("vla.models.fsdp.MIN_PARAMETERS", 1000):
             shard(model, init_device_mesh("cpu", (1, 2), mesh_dim_names=("copies", "shards")))
+        assert sum(isinstance(part, FSDPModule) for part in model.modules()) > 2
         ways = list[torch.Tensor]()
         for each in (model, whole):
             each.loss(batch)["loss"].backward()

@@ -294,8 +294,7 @@ class Environment(Protocol):
         events: (step, description) of what the agent did not cause, such as disturbances; recordings mark them,
         instructions, completed: number of instructions of the current episode, each given when the one before is
             completed, and how many are; it succeeds when all are, and fails as soon as one does,
-        benchmark: a property, number of seeds from `FIRST_SEED` on after which the episodes of a published benchmark
-            come again, or None.
+        distinct: a method, range of seeds → number of their different episodes, if some seeds have the same.
     """
 
     spec: Spec

@@ -249,20 +249,20 @@ def require_possible(experiment: Experiment) -> None:
                 world.reset(wanted.seed)  # such as with more blocks than colours
         except ValueError as error:
             raise UserError(f"condition {name} of the evaluation: {error}") from error
-    if hasattr(experiment.kind("task"), "benchmark"):
+    if hasattr(experiment.kind("task"), "distinct"):
         for name, changes in {IN_DISTRIBUTION: {}, **wanted.changes}.items():
             with closing(experiment.make_environment(changes)()) as world:
-                _require_benchmark(name, world, wanted)
+                _require_distinct(name, world, wanted)
 
 
-def _require_benchmark(condition: str, world: Any, wanted: Evaluation) -> None:
-    """Raise a UserError if an evaluation would play an episode of a benchmark twice in the world of a condition."""
-    count: int | None = world.benchmark
-    if count is not None and wanted.episodes > count:
+def _require_distinct(condition: str, world: Any, wanted: Evaluation) -> None:
+    """Raise a UserError if an evaluation would play an episode twice in the world of a condition."""
+    count: int = world.distinct(wanted.seeds)
+    if count < wanted.episodes:
         where = "" if condition == IN_DISTRIBUTION else f" in the condition {condition}"
         raise UserError(
-            f"evaluate.episodes={wanted.episodes}: the benchmark has {count} episodes{where}, and no interval may "
-            f"count one twice: set evaluate.episodes={count}"
+            f"evaluate.episodes={wanted.episodes}: there are {count} different ones{where}, and no interval may count "
+            f"one twice: set evaluate.episodes={count}"
         )
 
 

@@ -54,7 +54,6 @@ class Libero(ManyTasks):
         cameras: Names,
         mirror: bool,
         detail: Detail,
-        starts: Literal["by_seed", "drawn"],
         randomize: Randomize,
         steps: Literal["lerobot", "openpi"],
         settle: Natural,
@@ -71,8 +70,6 @@ class Libero(ManyTasks):
             cameras: names of cameras, such as "agentview" and "robot0_eye_in_hand".
             mirror: whether images are mirrored left to right, as those are that published policies were trained with.
             detail: of meshes and textures.
-            starts: "by_seed": the fifty states of the benchmark for seeds from `FIRST_SEED` to before `END`, for others
-                states that are drawn from the same regions; "drawn": always these.
             randomize: what else differs between drawn starts.
             steps: whose limits of an episode's steps.
             settle: steps before the first observation, in which things come to rest.
@@ -89,7 +86,7 @@ class Libero(ManyTasks):
         )
         self._tasks = [tasks_of(name)[number] for name in suites for number in chosen]
         self.tasks = tuple(task.name for task in self._tasks)
-        self._starts_of, self._limits, self._settle, self._mirror = starts, STEPS[steps], settle, mirror
+        self._limits, self._settle, self._mirror = STEPS[steps], settle, mirror
         self._randomize, self._renderer, self._detail = randomize, renderer, detail
         self.spec = Spec(
             cameras=tuple(cameras),
@@ -104,10 +101,10 @@ class Libero(ManyTasks):
             truth=(("object", 3), ("goal", 3)),
         )
 
-    @property
-    def benchmark(self) -> int | None:
-        """Number of seeds after which the official states come again; None without these."""
-        return STATES * len(self._tasks) if self._starts_of == "by_seed" else None
+    def distinct(self, seeds: range) -> int:
+        """Return the number of different episodes of seeds: after a while the official states come again."""
+        official = range(max(seeds.start, FIRST_SEED), min(seeds.stop, END))
+        return len(seeds) - max(0, len(official) - STATES * len(self._tasks))
 
     @property
     def tool(self) -> Array:
@@ -121,8 +118,7 @@ class Libero(ManyTasks):
         self.task, self.done, self.outcome, self._taken = task.name, False, "timeout", 0
         scene = self._scene = self._scene_of(task.scene, lambda: Scene(task, self._renderer, self.spec, self._detail))
         starts, self._goal = scene.started(task)
-        official = self._starts_of == "by_seed" and FIRST_SEED <= seed < END
-        state = (seed - FIRST_SEED) // len(self._tasks) % STATES if official else None
+        state = (seed - FIRST_SEED) // len(self._tasks) % STATES if FIRST_SEED <= seed < END else None
         # Each its own, so that one share changes nothing but what it is of.
         random, places, colours = (np.random.default_rng(key) for key in (seed, [seed, 4], [seed, 5]))
         exchanged = state is None and places.random() < self._randomize.places
