@@ -310,7 +310,10 @@ WRONG: dict[str, tuple[Any, str]] = {
 }
 
 
-def test_who_sends_nonsense_is_told_why_and_disturbs_nobody() -> None:
+def test_who_sends_nonsense_is_told_why_and_disturbs_nobody(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("vla.deploy.server.WARNINGS", 3)  # which do not fill the disk
     policy = as_policy(make_bc())
     expected = as_policy(policy.model).plan(observations(1)[0])
     with serving(policy) as url, client(url) as good:
@@ -329,6 +332,7 @@ def test_who_sends_nonsense_is_told_why_and_disturbs_nobody() -> None:
             with pytest.raises(ConnectionClosed, match="1009"):
                 large.recv()
         np.testing.assert_array_equal(ask(good, WHOLE)["actions"], expected)
+    assert [each.partition(" at ")[0] for each in caplog.messages] == ["refused a client"] * 3
 
 
 def test_only_so_many_come_in_and_only_with_the_key() -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from multiprocessing.shared_memory import SharedMemory
+from threading import Event
 from typing import Any
 from unittest.mock import Mock
 
@@ -92,6 +93,26 @@ def test_what_does_not_fit_is_said_and_no_memory_is_left_behind(monkeypatch: pyt
     for name in used:
         with pytest.raises(FileNotFoundError):
             SharedMemory(name)
+
+
+def test_a_worker_is_answered_until_it_has_left_also_when_the_context_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, seen, ending = as_policy(make_bc()), SPEC.random_observation(np.random.default_rng(0)), Event()
+
+    def accept(*arguments: Any) -> None:
+        _accept(*arguments)
+        ending.set()
+
+    def late(agent: Any) -> Any:
+        with closing(agent):
+            assert ending.wait(60)
+            agent.reset(seen.instruction, 0)
+            return agent.act(seen)
+
+    monkeypatch.setattr("vla.rollouts.shared_policy._accept", accept)
+    with ThreadPoolExecutor(1) as worker:
+        with shared_policy(lambda: policy) as make_agent:
+            action = worker.submit(late, make_agent(ToyEnvironment()))
+        assert action.result().shape == (3,)
 
 
 def test_an_error_that_cannot_be_sent_is_told() -> None:

@@ -11,9 +11,11 @@ from __future__ import annotations
 import asyncio
 import hmac
 import logging
+import math
 import queue
 import signal
 import time
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager, suppress
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
 
 FULL = "{} clients are connected: raise deploy.connections, or lower their cluster.workers\n"
 PATIENCE = 3.0  # with clients that open or close a connection [s]
+WARNINGS = 20  # of what clients do, in a minute
 INVALID, TOO_BIG, INTERNAL = 1007, 1009, 1011  # WebSocket close codes: invalid data, too large, error in the server
 
 log = logging.getLogger(__name__)
@@ -105,6 +108,7 @@ class Service:
         self._settings, self._policy = settings, policy
         self._waiting: asyncio.Queue[tuple[int, Observation, asyncio.Future[Array]]] = asyncio.Queue()
         self._lanes = set[int]()  # of the policy, one for each connection
+        self._warned = deque([-math.inf] * WARNINGS, WARNINGS)  # times of the last warnings [s]
 
     @contextmanager
     def in_thread(self) -> Iterator[str]:
@@ -167,20 +171,26 @@ class Service:
                 await connection.send(pack(await self._answer(lane, data)))
         except ConnectionClosed as closed:
             if closed.sent and closed.sent.code == TOO_BIG:
-                log.warning("a client's message has more than deploy.largest_message bytes: %s", closed.sent.reason)
+                self._warn("a client's message has more than deploy.largest_message bytes: %s", closed.sent.reason)
         except UserError as error:
             await self._refuse(connection, str(error), INVALID)
         except Exception:
-            log.exception("a client's observation caused an error")
+            self._warn("a client's observation caused an error", exc_info=True)
             await self._refuse(connection, "the server failed, see its log", INTERNAL)
         finally:
             self._lanes.remove(lane)
 
     async def _refuse(self, connection: ServerConnection, sentence: str, code: int) -> None:
-        log.warning("refused a client at %s: %s", connection.remote_address[0], " ".join(sentence.split())[:500])
+        self._warn("refused a client at %s: %s", connection.remote_address[0], " ".join(sentence.split())[:500])
         with suppress(ConnectionClosed):
             await connection.send(sentence)
             await connection.close(code, sentence.encode()[:120].decode(errors="ignore"))
+
+    def _warn(self, text: str, *values: str, exc_info: bool = False) -> None:
+        """Log a warning, unless there were `WARNINGS` within a minute: a client could fill the disk with them."""
+        if (now := time.monotonic()) > self._warned[0] + 60:
+            self._warned.append(now)
+            log.warning(text, *values, exc_info=exc_info)
 
     async def _answer(self, lane: int, data: str | bytes) -> dict[str, Any]:
         if isinstance(data, str):

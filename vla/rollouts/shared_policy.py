@@ -12,7 +12,7 @@ import queue
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from itertools import count
 from multiprocessing import AuthenticationError
@@ -54,13 +54,18 @@ def shared_policy(make_policy: Callable[[], _Planner]) -> Iterator[Callable[[Env
     """Run a policy for all workers on this machine within the context, which is entered with the factory of agents."""
     with one_thread_each(), Listener(family="AF_UNIX", authkey=(key := secrets.token_bytes(32))) as listener:
         policy, requests = make_policy(), queue.Queue[Request | None]()
-        with ThreadPoolExecutor(MOST) as talks, ThreadPoolExecutor(2) as threads:
-            threads.submit(_accept, listener, partial(talks.submit, _talk, policy, requests))
-            threads.submit(_serve, policy, requests)
+        with (
+            ThreadPoolExecutor(1) as serving,
+            ExitStack() as at_last,
+            ThreadPoolExecutor(MOST) as talks,
+            ThreadPoolExecutor(1) as accepting,
+        ):
+            at_last.callback(requests.put, None)  # once all talks have ended: each waits for its answers
+            serving.submit(_serve, policy, requests)
+            accepting.submit(_accept, listener, partial(talks.submit, _talk, policy, requests))
             try:
                 yield partial(_DistantPolicy, str(listener.address), key)
             finally:
-                requests.put(None)
                 with suppress(OSError), Client(listener.address, authkey=key) as last:
                     last.send(None)  # ends `_accept`, which would not notice that its socket is closed
 
