@@ -42,6 +42,9 @@ def test_without_images_all_is_grey_and_without_an_instruction_nothing_is_said()
     rollout(environment, WithoutModality(agent, "instruction"), FIRST_SEED)
     assert agent.heard == agent.seen[0].instruction == ""
     assert np.array_equal(agent.seen[0].rgb["front"], seen.rgb["front"])
+    rollout(environment, WithoutModality(agent, "both"), FIRST_SEED)
+    assert agent.heard == agent.seen[0].instruction == "" and (agent.seen[0].rgb["front"] == 128).all()
+    assert np.array_equal(agent.seen[0].state, seen.state)
 
 
 def test_the_nearest_demonstration_of_a_known_scene_is_its_own_unless_that_is_shown(folder: Path) -> None:

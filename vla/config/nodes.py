@@ -90,7 +90,7 @@ class Evaluation:
     recordings: Literal["all", "failures"] | Natural  # episodes to record; failures: and ten successes
     conditions: dict[str, Changes]  # name → overrides of the task
     one_by_one: dict[str, dict[str, Changes]]  # level → overrides of the task, each part of which is a condition
-    without: Annotated[list[Literal["images", "instruction"]], Predicate(unique)]  # what the policy lacks in conditions
+    without: Annotated[list[Literal["images", "instruction", "both"]], Predicate(unique)]  # what the policy lacks
     nearest: Text | None  # store of demonstrations, the most similar one of which is replayed in a condition
     networks: dict[str, Changes]  # nodes of `vla.rollouts.realtime.Network`
 

@@ -13,14 +13,14 @@ from vla.io.types import Count
 from vla.rollouts.rollout import AgentFactory, close_agent
 from vla.spec import Agent, Array, Environment, Observation, Spec
 
-Modality = Literal["images", "instruction"]
+Modality = Literal["images", "instruction", "both"]
 
 GREY = 128
 STRIDE = 4  # of the pixels in which demonstrations are compared
 
 
 class WithoutModality:
-    """An agent whose images are grey and without depth, or whose instruction is empty."""
+    """An agent whose images are grey and without depth, or whose instruction is empty, or both."""
 
     def __init__(self, agent: Agent, missing: Modality) -> None:
         """Take a modality from an agent."""
@@ -29,17 +29,17 @@ class WithoutModality:
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode."""
-        self._agent.reset("" if self._missing == "instruction" else instruction, seed)
+        self._agent.reset(instruction if self._missing == "images" else "", seed)
 
     def act(self, observation: Observation) -> Array:
         """Return the (D,) action of the agent."""
-        if self._missing == "instruction":
-            seen = replace(observation, instruction="")
-        else:
+        if self._missing != "images":
+            observation = replace(observation, instruction="")
+        if self._missing != "instruction":
             rgb = {camera: np.full_like(image, GREY) for camera, image in observation.rgb.items()}
             depth = {camera: np.zeros_like(image) for camera, image in observation.depth.items()}
-            seen = replace(observation, rgb=rgb, depth=depth)
-        action = self._agent.act(seen)
+            observation = replace(observation, rgb=rgb, depth=depth)
+        action = self._agent.act(observation)
         self.info = self._agent.info
         return action
 
