@@ -106,3 +106,14 @@ def test_what_a_killed_process_left_half_and_points_that_are_no_number_are_not_d
     assert "<svg" in compared([run.folder], tmp_path).read_text()
     (run.folder / "metrics.csv").write_text("")
     assert read_run(run.folder).metrics == {}
+
+
+def test_of_very_many_metrics_the_last_ones_are_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = a_run(tmp_path / "run", curves="step,train/loss\n" + "".join(f"{step},0.5\n" for step in range(10, 50)))
+    assert len(read_run(folder).metrics["train/loss"][0]) == 40 and not caplog.records
+    monkeypatch.setattr("vla.runs.folder.LARGEST_METRICS", 38)  # five rows and a part of one
+    steps, values = read_run(folder).metrics["train/loss"]
+    assert (steps.tolist(), {*values}) == ([45, 46, 47, 48, 49], {0.5})
+    assert "metrics.csv, which has 296 bytes, only the last rows are read" in caplog.text

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -15,12 +16,14 @@ import numpy as np
 import yaml
 
 from vla.config.differences import at
-from vla.io.documents import read_bounded, read_json, read_yaml
+from vla.io.documents import read_json, read_yaml
 from vla.io.errors import UserError
-from vla.io.files import write_text
+from vla.io.files import require_file, write_text
 from vla.rollouts.results import Report
 from vla.runs.files import Change, ErrorsFile, Node, ReportFile, Training
 from vla.spec import IN_DISTRIBUTION, Array
+
+log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 Curve = tuple[Array, Array]  # steps (N,) and values (N,)
@@ -32,6 +35,7 @@ RECORDINGS = "recordings"  # folder of moving pictures, and of single recordings
 SAMPLES, PLOT, SUITE = "samples.png", "report.png", "suite.png"
 ERRORS, ERRORS_PLOT = "errors.json", "errors.png"  # of an open-loop evaluation, in place of a report
 LARGEST_METRIC, MOST_METRICS = 1e100, 300  # that curves are drawn of; a training has about 20
+LARGEST_METRICS = 64 << 20  # [bytes] that are read, a quarter of a million rows
 LARGEST_REPORT = 4 << 30  # [bytes], a million episodes
 CHECKPOINTS, LAST = "checkpoints", "last.ckpt"  # what resumes a training: its folder, and the newest save
 
@@ -145,9 +149,18 @@ def _curves(path: Path) -> dict[str, Curve]:
 def metric_rows(path: Path) -> list[dict[str, str]]:
     """Read metrics.csv as rows of column → number, as text, without empty cells; each has a `step`.
 
-    There is a UserError if the file is too large, has no steps or holds something else than numbers.
+    Of a file larger than `LARGEST_METRICS` these are the last ones. There is a UserError if it has no steps or holds
+    something else than numbers.
     """
-    rows, found = csv.reader(io.StringIO(read_bounded(path).decode("utf-8", "replace"), newline="")), []
+    require_file(path)
+    with path.open("rb") as file:
+        head = file.readline(LARGEST_METRICS)
+        if (skipped := path.stat().st_size - LARGEST_METRICS) > len(head):
+            log.warning("of %s, which has %d bytes, only the last rows are read", path, path.stat().st_size)
+            file.seek(skipped)
+            file.readline(LARGEST_METRICS)  # the rest of a row
+        text = (head + file.read(LARGEST_METRICS)).decode("utf-8", "replace")
+    rows, found = csv.reader(io.StringIO(text, newline="")), []
     try:
         names = next(rows, ["step"])
         if "step" not in names or len(set(names)) < len(names) or len(names) > MOST_METRICS:
