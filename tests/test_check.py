@@ -191,6 +191,14 @@ def test_conditions_of_an_evaluation_are_checked_with_the_task_that_they_change(
         check(composed("+validate.changes.bloks=3"))
 
 
+def test_published_statistics_need_a_policy_that_has_some() -> None:
+    asked = ("job=train", "model=smolvla", "model.statistics=pretrained")
+    with pytest.raises(ValueError, match=r"^model\.statistics=pretrained takes those of a published policy: add pretr"):
+        check(composed(*asked))
+    for has_some in ("model.trunk=published", "pretrained=run"):
+        check(composed(*asked, has_some))
+
+
 @pytest.mark.parametrize("wrong", [["seen"], ["without_images", "+evaluate.without=[images]"], ["light_hard"]])
 def test_conditions_have_names_of_their_own(wrong: list[str]) -> None:
     name, *also = wrong

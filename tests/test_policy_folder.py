@@ -76,6 +76,23 @@ def test_equal_policies_have_the_same_digest(tmp_path: Path) -> None:
     assert read_policy(folders[0]).state == further | {"x": torch.ones(1)}
 
 
+def test_weights_that_a_policy_names_are_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def model(trunk: object, file: object) -> dict[str, Any]:
+        image = {"name": "trunk", "pretrained": str(file)}
+        return {"trunk": str(trunk), "text": {"name": str(trunk)}, "image": image, "network": {"image": image}}
+
+    monkeypatch.chdir(tmp_path)
+    Path("trunk").mkdir()
+    Path("blob").touch()
+    Path("encoder.pth").symlink_to("blob")  # as in the hub's cache
+    for given, stored in {
+        ("trunk", "encoder.pth"): (tmp_path / "trunk", tmp_path / "encoder.pth"),
+        ("hub:a/b", "auto"): ("hub:a/b", "auto"),
+    }.items():
+        found = read_policy(save_policy(Path("policy"), {**CONFIG, "model": model(*given)})).config
+        assert found["model"] == model(*stored)
+
+
 def test_what_is_no_policy_is_said_with_what_would_be_one(tmp_path: Path) -> None:
     run = tmp_path / "run"
     (run / "checkpoints").mkdir(parents=True)

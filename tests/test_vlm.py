@@ -281,8 +281,6 @@ def test_published_weights_and_statistics_are_loaded(tmp_path: Path, tokenizer: 
     assert all(torch.equal(weight, theirs[name]) for name, weight in loaded.items())
     assert torch.equal(model.action_normalizer.std, ours.action_normalizer.std)
     assert isinstance(model.network, SmolVLA) and str(model.network.vlm.source).startswith(str(folder))
-    with pytest.raises(UserError, match=r"model\.statistics=pretrained takes those of a published policy"):
-        make_smolvla(tokenizer, statistics="pretrained").fit(steps(4), steps(3))
     model.fit(steps(4) + 5, steps(3) + 5)  # which are not asked for
     assert torch.equal(model.action_normalizer.mean, ours.action_normalizer.mean)
 
@@ -420,6 +418,10 @@ def test_a_normaliser_without_the_action_and_a_camera_without_counterpart_are_re
     (folder / "config.json").write_text(json.dumps(config))
     with pytest.raises(UserError, match="sees front, third, and the demonstrations have front, wrist"):
         make_smolvla(tokenizer, trunk=str(folder))
+    with pytest.raises(
+        UserError, match=r"model\.cameras names one camera twice, front, front: null for one that has n"
+    ):
+        make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "front", "third": "front"})
     with pytest.raises(UserError, match="no counterpart of third"):
         make_smolvla(tokenizer, trunk=str(folder), cameras={"front": "front"})
     with pytest.raises(UserError, match="names top, and the demonstrations have front, wrist"):

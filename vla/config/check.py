@@ -88,6 +88,11 @@ def _check(experiment: Experiment, job: Job) -> None:
 
             method = locate("policy.chunking._target_", chunking["_target_"])
             require_chunking(method, kinds[1], config["model"].get("prefix", 0))
+        model, begun = config["model"], settings.pretrained or settings.checkpoint
+        if model.get("statistics") == "pretrained" and model.get("trunk", "") is None and not begun:
+            raise UserError(
+                "model.statistics=pretrained takes those of a published policy: add pretrained=…, or leave that out"
+            )
     _check_contents(experiment, groups)
 
 

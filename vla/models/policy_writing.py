@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from vla.io.documents import mappings
 from vla.io.files import atomic_path, write_json
 from vla.io.versions import installed_versions
 from vla.models import policy_folder as files
@@ -95,11 +96,13 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
 
 
 def _located(model: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the node of a model with absolute names of folders of weights, which are found from any other folder."""
+    """Return the node of a model with absolute names of files and folders of weights, found from any other folder."""
     located = copy.deepcopy({**model})
-    for node, key in ((located, "trunk"), (located.get("text"), "name")):
-        if isinstance(node, dict) and isinstance(name := node.get(key), str) and Path(name).is_dir():
-            node[key] = str(Path(name).resolve())
+    encoders = ((node, "pretrained", Path.is_file) for node in mappings(located))
+    parts = [(located, "trunk", Path.is_dir), (located.get("text"), "name", Path.is_dir), *encoders]
+    for node, key, is_there in parts:
+        if isinstance(node, dict) and isinstance(name := node.get(key), str) and is_there(Path(name)):
+            node[key] = str(Path(name).absolute())  # a link keeps its name, whose ending tells the format
     return located
 
 

@@ -75,12 +75,6 @@ class Normalizer(nn.Module):
                 raise UserError(f"{source} has {feature}.{name} of {found.numel()} components, not of {own.numel()}")
             own.copy_(found)
 
-    @property
-    def known(self) -> bool:
-        """Whether there are statistics: otherwise it changes nothing."""
-        first, second = (getattr(self, name) for name in self.statistics)
-        return bool((second != 1).any() or (first != (0 if self.kind == "mean_std" else -1)).any())
-
     def forward(self, values: Tensor) -> Tensor:
         """Normalise (…, W) values."""
         if self.kind == "mean_std":

@@ -121,18 +121,13 @@ class VisionLanguageAction(Model):
         self.register_buffer("noise", noise, persistent=False)
 
     def fit(self, states: np.ndarray, actions: np.ndarray) -> None:
-        """Normalise by the statistics of (N, P) states and (N, D) actions, unless they are those of the trunk
-        (UserError: it has none)."""
+        """Normalise by the statistics of (N, P) states and (N, D) actions, unless they are those of the trunk."""
         if not (self.network.state_width or self.text.state):  # as openpi trains π0.5 on LIBERO
             text = "%s sees the state in the sentence only, and it is not there: model.text.state=true adds it"
             log.warning(text, type(self.network).__name__)
         if self.statistics == "demonstrations":
             self.state_normalizer.fit(states[:, self.spec.pose], constant=1.0)
             self.action_normalizer.fit(actions)
-        elif not self.action_normalizer.known:
-            raise UserError(
-                "model.statistics=pretrained takes those of a published policy: add pretrained=…, or leave that out"
-            )
 
     def known(self, batch: Batch) -> Prefix:
         """Encode the newest frame and the sentence."""
@@ -274,4 +269,6 @@ def _cameras(named: dict[str, str | None] | None, spec: Spec, trunk: Trunk | Non
         raise UserError(f"model.cameras names {', '.join(unknown)}, and the demonstrations have {ours}")
     if not chosen:
         raise UserError(f"model.cameras names none of the cameras of the demonstrations, {ours}")
+    if len({*chosen}) < len(chosen):
+        raise UserError(f"model.cameras names one camera twice, {', '.join(chosen)}: null for one that has none")
     return chosen
