@@ -233,7 +233,7 @@ def test_an_expert_that_does_not_look_leaves_the_same_demonstrations_from_fewer_
     "world",
     [
         ("task/randomize=wide",),
-        ("task=metaworld", "task.tasks=[push]"),
+        ("task=metaworld", "task.tasks=[push]", "task.window=[0.2,0,0.8,0.8]"),
         (*PLAIN, "task.suite=goal", "task.tasks=[7]", "expert.perturb.noise=0", "expert.perturb.missed=0"),
     ],
     ids=" ".join,

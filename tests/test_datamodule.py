@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from vla.data.datamodule import Prefetcher, held_out
 from vla.data.episodes import EpisodeStore, observations_of
 from vla.data.verification import episode_of
 from vla.data.window_batches import WindowBatcher, perturbed
+from vla.io.images import resize
+from vla.io.parts import Part
 from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.spec import Array
@@ -93,6 +96,20 @@ def test_a_further_store_may_lack_the_truth(folder: Path, tmp_path: Path) -> Non
     batch = module.make_batch(np.array([0, last, last + 1]))
     assert torch.isfinite(batch["truth"][0]).all() and batch["truth"][1:, -1].isnan().all()
     np.testing.assert_array_equal(batch["state"][1, -1], np.asarray(source.rows("state"))[0])
+
+
+def test_a_further_store_may_have_images_of_another_size(folder: Path, tmp_path: Path) -> None:
+    further = toy.make_store(tmp_path, partial(toy.ToyEnvironment, spec=replace(toy.SPEC, image_size=(12, 24))))
+    module, first = windows(folder, more=[tmp_path]), EpisodeStore(folder)
+    start = first.episodes[-1].end
+    images = module.make_batch(np.array([5, start + 5, start]))["rgb"]["eye"]
+    for seen, store, row in zip(images, (first, further, further), (5, 5, 0), strict=True):
+        np.testing.assert_array_equal(seen[-1], resize(np.asarray(store.rows("rgb_eye"))[row], (16, 16)))
+    assert not images[2, :-1].any()  # before the start of the episode
+    with pytest.raises(ValueError, match=r"the model has image_size = \(16, 16\), but .* has \(12, 24\)"):
+        windows(folder, more=[tmp_path], spec=replace(toy.SPEC, parts=(Part("eye"),)))
+    with pytest.raises(ValueError, match="the model has truth = "):
+        windows(tmp_path, spec=replace(toy.SPEC, truth=(("target", 2),)))
 
 
 def test_every_window_comes_once_per_shuffle(folder: Path) -> None:

@@ -277,8 +277,9 @@ def test_a_store_that_was_put_together_is_of_a_task_as_any_other(
     assert "chosen was derived" not in caplog.text
     collected("chosen", "task.time_limit=6")
     assert "chosen was derived from demonstrations with another task" in caplog.text
-    with pytest.raises(UserError, match=r"the episode store .*chosen has image_size = .* the task has"):
-        collected("chosen", "task.image_size=[64,64]")
+    collected("chosen", "task.image_size=[64,64]")
+    with pytest.raises(UserError, match=r"the episode store .*chosen has cameras = .* the task has"):
+        collected("chosen", "task.cameras=[front]")
 
 
 def test_the_job_merges_and_refuses_what_contradicts_itself(tmp_path: Path) -> None:

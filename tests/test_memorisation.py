@@ -66,8 +66,19 @@ def test_the_nearest_demonstration_of_a_known_scene_is_its_own_unless_that_is_sh
     assert np.array_equal(own, any_of_them) and not np.array_equal(own, theirs)
 
 
-def _first_action(agent: NearestDemonstration, observation: Observation) -> Array:
-    agent.reset(observation.instruction, 0)
+def test_demonstrations_with_images_of_another_size_are_replayed(folder: Path) -> None:
+    store, environment = EpisodeStore(folder), toy.make_environment()
+    agent = NearestDemonstration(folder, None, spec=replace(toy.SPEC, image_size=(32, 48)))
+    for entry in store.episodes[:5]:
+        seen = environment.reset(entry.seed)
+        wide = np.zeros((32, 48, 3), np.uint8)  # sharper, and with sides that the demonstrations do not show
+        wide[:, 8:40] = seen.rgb["eye"].repeat(2, 0).repeat(2, 1)
+        recorded = store.rows("executed")[entry.span][0]
+        assert np.array_equal(_first_action(agent, replace(seen, rgb={"eye": wide}), FIRST_SEED), recorded)
+
+
+def _first_action(agent: NearestDemonstration, observation: Observation, seed: int = 0) -> Array:
+    agent.reset(observation.instruction, seed)
     return agent.act(observation)
 
 

@@ -317,6 +317,8 @@ def test_the_fast_renderer_draws_what_mujocos_does(parts: Parts) -> None:
         ("task.tasks=[reach,fly]", "Meta-World has no task fly: it has assembly, basketball"),
         ("task.tasks=[reach] task.cameras=[corner2,wrist]", "task.cameras names wrist; Meta-World has topview, corner"),
         ("task.tasks=[reach] task.window=[0.5,0,0.4,1]", "top above bottom, left of right"),
+        ("task.image_size=[96,128]", r"task.image_size=\[96, 128\] would stretch what corner2 shows, which is square"),
+        ("task.image_size=[96,128] task.cameras=[corner2,hand] task.window=[0,0,0.6,0.8]", "what hand shows, which"),
     ],
 )
 def test_unknown_tasks_cameras_and_windows_are_refused(override: str, words: str) -> None:

@@ -46,7 +46,7 @@ def policy_of(store: Path, environment: Any = None, overrides: tuple[str, ...] =
     experiment, opened = Experiment.of(composed(*overrides)), EpisodeStore(store)
     learner = experiment.fitted_learner(opened)
     network = learner.model
-    data = experiment.data(opened, network.history, network.chunk, network.text.tokenize)
+    data = experiment.data(opened, network.history, network.chunk, network)
     make_trainer(2).fit(learner, datamodule=data)
     return as_policy(network, opened.spec)
 

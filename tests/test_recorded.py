@@ -249,12 +249,23 @@ def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset
     assert repeated["seeds"] == errors["seeds"] and repeated["components"] == errors["components"]
     assert "learner.lr" not in compared([tmp_path / "run", tmp_path / "again"], tmp_path).read_text()
     forgot = here(tmp_path, *again, "task=recorded", f"expert.folder={dataset}", ok=False)
-    assert "has image_size = (24, 32), but the task, with the options given here, has (96, 128)" in forgot.stderr
-    (kept,) = tmp_path.glob("outputs/episodes/*")  # both found it
+    assert "was trained with task.image_size=[24, 32], not [96, 128], and knows the episodes" in forgot.stderr
+    (kept,) = tmp_path.glob("outputs/episodes/*")  # both found it, and the third imported nothing
     shutil.rmtree(kept)
     assert "name its folder with expert=lerobot expert.folder=DIR" in here(tmp_path, *again, ok=False).stderr
     fewer = here(tmp_path, *again, *small(dataset), "collect.episodes=6", ok=False)
     assert "was trained on other episodes than the 6" in fewer.stderr
+
+
+def test_a_policy_of_another_size_of_images_is_trained_further_and_evaluated(dataset: Path, tmp_path: Path) -> None:
+    options = "job=collect collect.folder=further collect.episodes=2 task.image_size=[12,20] output=collect"
+    here(tmp_path, *small(dataset), *options.split())
+    here(tmp_path, *small(dataset), *TRAINING, *TINY, "job=train", "hydra.run.dir=run", "output=run")
+    recording = (*small(dataset), "task.image_size=[18,18]", "collect.more=[further]")
+    here(tmp_path, *recording, *TRAINING, "pretrained=run", "output=second", "hydra.run.dir=second")
+    assert read_policy(tmp_path / "second").spec.image_size == (24, 32)
+    errors = json.loads((tmp_path / "second/errors.json").read_text())
+    assert errors["seeds"] == [seed for seed in range(EPISODES) if held_out(seed, 0.2)]
 
 
 def test_a_training_on_all_episodes_ends_with_success_and_is_complete(dataset: Path, tmp_path: Path) -> None:

@@ -21,19 +21,17 @@ from vla.data.window_batches import WindowBatcher
 from vla.deploy import messages
 from vla.deploy.client_observation import Keys
 from vla.deploy.inference import Inference
-from vla.io.images import resize
+from vla.io.images import Fit, fitted, resize
 from vla.io.parts import Part
-from vla.models import transforms
 from vla.models.layers import Batch
 from vla.models.model import Model
-from vla.models.transforms import Fit
 
 FITS = get_args(Fit)
 TRAINED, RAW = replace(SPEC, image_size=(16, 24)), replace(SPEC, image_size=(45, 31))
 
 
 def resized(image: np.ndarray, size: tuple[int, int], fit: Fit) -> np.ndarray:
-    return transforms.resized(torch.from_numpy(image)[None, None], size, fit)[0, 0].numpy()
+    return fitted(torch.from_numpy(image)[None, None], size, fit)[0, 0].numpy()
 
 
 def test_the_centre_is_used_or_all_is_squeezed_or_framed() -> None:
@@ -52,7 +50,7 @@ def test_any_size_is_taken_and_the_size_itself_is_left_alone(fit: Fit) -> None:
         image = resized(np.full((*shape, 3), 77, np.uint8), (96, 64), fit)
         assert image.shape == (96, 64, 3) and set(np.unique(image)) <= {0, 77} and (image == 77).any()
     images = torch.zeros(2, 3, 96, 64, 3, dtype=torch.uint8)
-    assert transforms.resized(images, (96, 64), fit) is images
+    assert fitted(images, (96, 64), fit) is images
 
 
 @pytest.mark.parametrize("fit", FITS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,10 @@ def test_memory_is_used_again_once_nothing_refers_to_it() -> None:
     assert memory.empty((2, 3), torch.uint8).__array_interface__["data"] == place
 
 
-def test_what_a_gpu_reads_is_page_locked_and_without_gaps(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("size", [(16, 16), (8, 12)])
+def test_what_a_gpu_reads_is_page_locked_and_without_gaps(
+    size: tuple[int, int], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pinned, empty = set[int](), torch.empty
 
     def allocated(*size: Any, pin_memory: bool = False, **options: Any) -> torch.Tensor:
@@ -59,8 +63,8 @@ def test_what_a_gpu_reads_is_page_locked_and_without_gaps(folder: Path, monkeypa
 
     monkeypatch.setattr(torch, "empty", allocated)
     monkeypatch.setattr(torch.Tensor, "pin_memory", pin)
-    store = EpisodeStore(folder)
-    batch, plain = (WindowBatcher(store, 2, 3, for_gpu)(np.arange(8)) for for_gpu in (True, False))
+    store, spec = EpisodeStore(folder), replace(toy.SPEC, image_size=size)
+    batch, plain = (WindowBatcher(store, 2, 3, for_gpu, spec)(np.arange(8)) for for_gpu in (True, False))
     tensors = [name for name, values in plain.items() if isinstance(values, torch.Tensor)]
     pairs = [(batch[name], plain[name]) for name in tensors]
     pairs += [(batch["rgb"][camera], images) for camera, images in plain["rgb"].items()]

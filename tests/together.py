@@ -75,7 +75,7 @@ def train(store: Path, folder: Path, *overrides: str, checkpoint: Path | None = 
     learner = untrained(store, *overrides)
     trainer = make_trainer(experiment.config, folder)
     model = learner.model
-    data = experiment.data(EpisodeStore(store), model.history, model.chunk, model.text.tokenize)
+    data = experiment.data(EpisodeStore(store), model.history, model.chunk, model)
     trainer.fit(learner, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     for name in (LAST, POLICY):
         trainer.save_checkpoint(folder / name, weights_only=False)

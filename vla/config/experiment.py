@@ -235,16 +235,15 @@ class Experiment:
         learner.model.fit(store.numbers("state"), store.numbers("action"))
         return learner
 
-    def data(
-        self, store: EpisodeStore, history: int, chunk: int, tokenize: Callable[[list[str]], Any] | None = None
-    ) -> WindowDataModule:
+    def data(self, store: EpisodeStore, history: int, chunk: int, model: Model | None = None) -> WindowDataModule:
         """Build windows of `history` frames and `chunk` actions from the episodes that `collect` names.
 
-        `tokenize` is that of a text encoder.
+        Those for a `model` fit its spec, and have its tokens of the instructions.
         """
-        windows = {"history": history, "chunk": chunk, "tokenize": tokenize}
+        windows = {"history": history, "chunk": chunk, "tokenize": model.text.tokenize if model else None}
         episodes = {"episodes": self.collect.episodes, "more": self.collect.more or ()}
-        return self.build("data", folder=store.folder, spec=store.spec, **windows, **episodes)
+        spec = model.spec if model else store.spec
+        return self.build("data", folder=store.folder, spec=spec, **windows, **episodes)
 
 
 def _class_differs(key: str, here: Node, there: Node) -> bool:

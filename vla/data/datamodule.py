@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -100,7 +101,7 @@ class WindowDataModule(LightningDataModule):
 
     Args:
         folder: the episode store.
-        spec: layout of a step that the model expects.
+        spec: layout of a step that the model expects; images of another size are cropped and resized to its own.
         history: frames T in a window.
         chunk: actions k that label a frame.
         seed: of the order of training windows.
@@ -141,9 +142,10 @@ class WindowDataModule(LightningDataModule):
         rows = [max((entry.end for entry in store.episodes), default=0) for store in stores]
         trained, unseen = list[Array](), list[Array]()
         for store, first in zip(stores, np.cumsum([0, *rows]), strict=False):
-            # A further store may lack the truth, which becomes NaN.
-            expected = self._spec if store.spec.truth else self._spec.without_truth
-            expected.require(store.spec, "the model", f"the episode store {store.folder}")
+            name = f"the episode store {store.folder}"
+            self._spec.require_input(store.spec, "the model", name)
+            if store.spec.truth:  # a further store may lack it, which becomes NaN
+                replace(store.spec, truth=self._spec.truth).require(store.spec, "the model", name)
             for entry in store.episodes:
                 side = unseen if held_out(entry.recording, self._fraction) else trained
                 side.append(first + np.arange(entry.start, entry.end))
@@ -156,7 +158,7 @@ class WindowDataModule(LightningDataModule):
         self._digest = digest_of(episodes)
         self.training_windows = np.concatenate(trained)  # row numbers
         self.held_out_windows = np.concatenate([np.empty(0, np.int64), *unseen])
-        layout = self._history, self._chunk, self._on_gpu(), self._spec.truth_size
+        layout = self._history, self._chunk, self._on_gpu(), self._spec
         self._batchers, self._starts = [WindowBatcher(store, *layout) for store in stores], np.cumsum([0, *rows])[:-1]
 
     def make_batch(self, windows: Array) -> Batch:

@@ -14,6 +14,7 @@ import torch
 
 from vla.data.episodes import EpisodeStore
 from vla.data.fields import Rows
+from vla.io.images import fitted
 from vla.spec import Array, Spec
 
 Batch = dict[str, Any]
@@ -67,11 +68,12 @@ class WindowBatcher:
         history: frames T in a window.
         chunk: actions k that label a frame.
         pin: allocate page-locked memory, from which copies to a GPU are asynchronous.
-        truth_size: number S of truth scalars, NaN if the store has no truth; None: that of the store.
+        spec: of the batches, None: of the store. Images of another size are cropped at the centre and resized, and
+            truth that the store lacks is NaN.
     """
 
     def __init__(
-        self, store: EpisodeStore, history: int, chunk: int, pin: bool = False, truth_size: int | None = None
+        self, store: EpisodeStore, history: int, chunk: int, pin: bool = False, spec: Spec | None = None
     ) -> None:
         self._pin, self._buffers = pin, BufferPool()
         self._ages, self._aheads = np.arange(1 - history, 1), np.arange(chunk)
@@ -80,7 +82,7 @@ class WindowBatcher:
         names = ("state", *(("truth",) if store.spec.truth else ()))
         numbers = {name: store.rows(name) for name in (*names, "action", "executed")}
         store.verify(store.episodes, numbers)
-        self._truth_size = store.spec.truth_size if truth_size is None else truth_size
+        self._size, self._truth_size = (spec or store.spec).image_size, (spec or store.spec).truth_size
         known = [numbers[name][:] for name in names]
         # Truth that this store lacks, and others beside it have.
         unknown = np.full((len(known[0]), self._truth_size - store.spec.truth_size), np.nan, np.float32)
@@ -116,7 +118,8 @@ class WindowBatcher:
         frames = np.maximum(frames, first)
         before = self._perturbations[labels] - self._perturbations[frames][:, :, None]
         absent = None if present.all() else ~present
-        batch: Batch = {"rgb": {camera: self._take(rows, frames, absent) for camera, rows in self._images.items()}}
+        images = {camera: self._take(rows, frames, absent) for camera, rows in self._images.items()}
+        batch: Batch = {"rgb": {camera: self._own(fitted(each, self._size, "crop")) for camera, each in images.items()}}
         numbers = self._take(self._numbers, frames, absent)
         state = self._numbers.shape[1] - self._truth_size
         batch["state"] = self._own(numbers[..., :state])

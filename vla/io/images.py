@@ -28,11 +28,16 @@ Fit = Literal["crop", "pad", "stretch"]  # for another aspect ratio: the centre,
 
 
 def fitted(images: Tensor, size: tuple[int, int], fit: Fit) -> Tensor:
-    """Resize (N, H, W, 3) uint8 images to `size` (height, width), bilinear and antialiased, on their device."""
+    """Resize (N, …, H, W, 3) uint8 images to `size` (height, width), bilinear and antialiased, on their device.
+
+    Images of that size are returned as they are.
+    """
+    (height, width), shape = size, images.shape[-3:-1]
+    if shape == (height, width):
+        return images
     import torch.nn.functional as F  # takes seconds
 
-    (height, width), shape = size, images.shape[1:3]
-    x = images.permute(0, 3, 1, 2)
+    x = images.flatten(0, -4).permute(0, 3, 1, 2)
     rows, columns = height, width  # of the result that show the images
     if fit == "crop":
         scale = min(shape[0] / height, shape[1] / width)
@@ -48,7 +53,7 @@ def fitted(images: Tensor, size: tuple[int, int], fit: Fit) -> Tensor:
         x = F.interpolate(x, (rows, columns), mode="bilinear", antialias=True)
     top, left = (height - rows) // 2, (width - columns) // 2
     x = F.pad(x, (left, width - columns - left, top, height - rows - top))
-    return x.to(images.dtype).permute(0, 2, 3, 1).contiguous()
+    return x.to(images.dtype).permute(0, 2, 3, 1).contiguous().unflatten(0, images.shape[:-3])
 
 
 def resize(image: Array, size: tuple[int, int]) -> Array:

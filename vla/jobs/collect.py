@@ -37,8 +37,7 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
         if folder and Path(folder).exists() and not store.derived and (recorded := _source(experiment)[2]):
             recorded.require_held(store)
         if store.derived:
-            spec = experiment.world().spec
-            store.spec.without_truth.require(spec.without_truth, f"the episode store {store.folder}", "the task")
+            store.spec.require_input(experiment.world().spec, f"the episode store {store.folder}", "the task")
         if others := [key for key, node in experiment.source.items() if store.lacks(key, node)]:
             log.warning(
                 "%s was derived from demonstrations with another %s", store.folder, " and another ".join(others)

@@ -49,7 +49,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
         facts["model"] = facts["agent"]
     else:
         policy = experiment.make_policy(checkpoint)()
-        policy.spec.without_truth.require(store.spec.without_truth, f"the checkpoint {checkpoint}", f"{store.folder}")
+        policy.spec.require_input(store.spec, f"the checkpoint {checkpoint}", f"{store.folder}")
         _require_trained_on(store, experiment.collect.more or (), checkpoint)
         facts |= costs(policy)
     try:
@@ -77,8 +77,15 @@ def _held_out(experiment: Experiment, checkpoint: Path | None) -> float:
     fraction, whose = experiment["data"]["validation_fraction"], "a training would be"
     if checkpoint is not None:
         saved, whose = read_policy(checkpoint), f"{checkpoint} was trained"
-        trained, world = saved.spec.without_truth, experiment.world().spec.without_truth
-        trained.require(world, f"the checkpoint {checkpoint}", "the task, with the options given here,")
+        world = experiment.world().spec
+        saved.spec.require_input(world, f"the checkpoint {checkpoint}", "the task, with the options given here,")
+        # Else `_require_trained_on` would find other images, after an import.
+        size, asked = (at(config, "task.image_size") for config in (saved.config, experiment.config))
+        if size != asked:
+            raise UserError(
+                f"{checkpoint} was trained with task.image_size={str(size)[:50]}, not {asked}, and knows the episodes "
+                "that were held out by their images: set it as in training"
+            )
         fraction = at(saved.config, "data.validation_fraction", None)
     if not isinstance(fraction, float | int) or not fraction:
         raise UserError(

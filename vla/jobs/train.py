@@ -156,7 +156,7 @@ def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_s
 
 def _windows(experiment: Experiment, store: EpisodeStore, model: Model, trainer: Trainer) -> WindowDataModule:
     """Return the windows of a store for a model, and draw some; a UserError if there are less than a batch."""
-    data = experiment.data(store, model.history, model.chunk, model.text.tokenize)
+    data = experiment.data(store, model.history, model.chunk, model)
     data.setup()
     if data.batch_size > len(data.training_windows):
         raise UserError(

@@ -1,7 +1,4 @@
-"""What happens between an observation and a model, the same in training, evaluation, serving and on a robot.
-
-Shapes: B batch, T frames, H by W pixels.
-"""
+"""What happens between an observation and a model, the same in training, evaluation, serving and on a robot."""
 
 from __future__ import annotations
 
@@ -36,14 +33,7 @@ class Transforms:
     def __call__(self, batch: Batch) -> Batch:
         """Return the input of a model: its images have `image_size`, and "text" is there, made of "instruction"."""
         # Cropped whatever `fit` is, as importers do, who know no model: so a robot's camera shows what they stored.
-        rgb = {camera: resized(images, self.demonstrations, "crop") for camera, images in batch["rgb"].items()}
-        rgb = {camera: resized(images, self.size, self.fit) for camera, images in rgb.items()}
+        rgb = {camera: fitted(images, self.demonstrations, "crop") for camera, images in batch["rgb"].items()}
+        rgb = {camera: fitted(images, self.size, self.fit) for camera, images in rgb.items()}
         text = batch["text"] if "text" in batch else self.tokenize(batch["instruction"]).to(batch["state"].device)
         return {**batch, "rgb": rgb, "text": text}
-
-
-def resized(images: Tensor, size: tuple[int, int], fit: Fit) -> Tensor:
-    """Resize (B, T, H, W, 3) uint8 images as `vla.io.images.fitted`; those of the size are returned as they are."""
-    if images.shape[2:4] == size:
-        return images
-    return fitted(images.flatten(0, 1), size, fit).unflatten(0, images.shape[:2])

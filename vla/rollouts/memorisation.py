@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vla.data.episodes import EpisodeStore
+from vla.io.images import resize
 from vla.io.types import Count
 from vla.rollouts.rollout import AgentFactory, close_agent
 from vla.spec import Agent, Array, Environment, Observation, Spec
@@ -57,8 +58,8 @@ class NearestDemonstration:
     """Replays the demonstration with the most similar first images, whatever happens; then repeats its last action.
 
     The demonstration has another seed and, if one exists, the same instruction. The distance of two first images is the
-    mean absolute difference over every `STRIDE`th row and column of all cameras. This baseline for memorisation
-    succeeds where remembering the demonstrations is enough.
+    mean absolute difference over every `STRIDE`th row and column of all cameras, in the size of the demonstrations.
+    This baseline for memorisation succeeds where remembering the demonstrations is enough.
     """
 
     def __init__(self, folder: Path, episodes: Count | None, *, spec: Spec) -> None:
@@ -73,7 +74,8 @@ class NearestDemonstration:
         rows = [store.rows(f"rgb_{camera}") for camera in spec.cameras]
         starts = [entry.span.start for entry in self._entries]
         images = [[_subsampled(each[start : start + 1])[0] for each in rows] for start in starts]
-        self._cameras, self._images = spec.cameras, np.array(images)  # (E, cameras, h, w, 3)
+        self._cameras, self._size = spec.cameras, store.spec.image_size
+        self._images = np.array(images)  # (E, cameras, h, w, 3)
         self.info: dict[str, Any] = {}
         self.reset("", 0)
 
@@ -97,7 +99,8 @@ class NearestDemonstration:
         return np.asarray(action, np.float32)
 
     def _nearest(self, observation: Observation) -> int:
-        seen = np.stack([_subsampled(observation.rgb[camera]) for camera in self._cameras]).astype(np.int16)
+        images = [_subsampled(resize(observation.rgb[camera], self._size)) for camera in self._cameras]
+        seen = np.stack(images).astype(np.int16)
         known = np.flatnonzero(self._others & (self._instructions == observation.instruction))
         candidates = known if len(known) else np.flatnonzero(self._others)
         distances = [np.abs(self._images[index] - seen).mean() for index in candidates]
@@ -107,11 +110,11 @@ class NearestDemonstration:
 def open_memory(folder: Path, episodes: int | None, spec: Spec) -> EpisodeStore:
     """Open the store of the demonstrations to replay in a world with a spec.
 
-    There is a UserError if there is no such store, it has no or fewer episodes, or another spec.
+    There is a UserError if there is no such store, it has no or fewer episodes, or its spec does not fit.
     """
     store = EpisodeStore(folder, episodes)
     store.require_episodes()
-    store.spec.without_truth.require(spec.without_truth, f"the episode store {folder}", "the task")
+    store.spec.require_input(spec, f"the episode store {folder}", "the task")
     return store
 
 

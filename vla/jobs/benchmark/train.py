@@ -44,7 +44,7 @@ def train(experiment: Experiment) -> dict[str, Measure]:
     for _ in range(asked.rounds):
         for _, changed, learner, rounds in trials:
             model, watch = learner.model, _Stopwatch(asked.steps)
-            data = changed.data(store, model.history, model.chunk, model.text.tokenize)
+            data = changed.data(store, model.history, model.chunk, model)
             with explain_memory_errors(experiment.config), TemporaryDirectory() as folder:
                 trainer = make_trainer(changed.config, Path(folder) / CHECKPOINTS, watch)
                 trainer.fit(learner, datamodule=data)

@@ -13,7 +13,7 @@ from vla.io.errors import UserError, suggestion
 from vla.io.types import ImageSize, Names, Natural, Share, Text
 from vla.spec import Array, Observation, Spec
 from vla.tasks.metaworld.package import tasks_of
-from vla.tasks.metaworld.scene import TaskScene, parts_of
+from vla.tasks.metaworld.scene import CAMERA, TaskScene, parts_of
 from vla.tasks.rendering.renderer import RendererFactory
 from vla.tasks.world import ManyTasks
 
@@ -62,7 +62,7 @@ class MetaWorld(ManyTasks):
             sentences: task → instruction.
             tiers: difficulty → tasks, for reports.
             renderer: renderer of the images.
-            image_size: height and width of every camera's images [px].
+            image_size: height and width of every camera's images [px]; the same, unless all they show is a `window`.
             cameras: names of cameras, such as "corner2", which is moved and turned as LeRobot does, or "hand", the part
                 of "corner2" around a point 75 mm below the hand, in whole pixels of LeRobot's picture.
             window: top, left, bottom and right of LeRobot's picture that "corner2" shows, as shares of its height and
@@ -74,7 +74,7 @@ class MetaWorld(ManyTasks):
             steps: largest number of steps of an episode.
 
         Raises:
-            UserError: a task is unknown or has no sentence.
+            UserError: a task is unknown or has no sentence, or pictures would be stretched.
         """
         super().__init__()
         known = self._known = tasks_of("mt50")  # the truth names a task by its place here
@@ -85,6 +85,12 @@ class MetaWorld(ManyTasks):
             raise UserError(f"Meta-World has no task {', '.join(unknown)}{among}")
         if silent := [name for name in self.tasks if name not in sentences]:
             raise UserError(f"task.sentences has none for {', '.join(silent)}")
+        squares = [name for name in cameras if name != CAMERA or window is None]
+        if squares and image_size[0] != image_size[1]:
+            raise UserError(
+                f"task.image_size={[*image_size]} would stretch what {', '.join(squares)} shows, which is square: give "
+                "height and width the same number of pixels"
+            )
         self.spec = Spec(
             cameras=tuple(cameras),
             image_size=(image_size[0], image_size[1]),
