@@ -1,4 +1,4 @@
-"""Policies and their worlds for programs of one's own; everything else is `python -m vla.run`."""
+"""Trained policies and their worlds, for use in Python programs; everything else is `python -m vla.run`."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def load_policy(
         checkpoint: the folder of a policy, or of a run that has one, or hub:owner/name@revision.
         device: such as "cpu" or "cuda"; "auto": a GPU if there is one.
         precision: "fp32" or "bf16".
-        lanes: rows of every pass through the model, for as many worlds side by side: `policy.act(observations, lanes)`.
-        trust: names of further packages.
+        lanes: batch size of the model, for as many worlds side by side: `policy.act(observations, lanes)`.
+        trust: names of further packages whose classes may be loaded.
 
     Raises:
         UserError: there is no such policy, it is damaged, or it names a class that is not trusted.
@@ -50,13 +50,13 @@ def load_environment(
     """Make the world in which a policy was trained, as an environment of gymnasium.
 
     Args:
-        checkpoint: as of `load_policy`.
+        checkpoint: as in `load_policy`.
         changes: to the task, as in the conditions of an evaluation, such as {"time_limit": 20.0}.
-        trust: as of `load_policy`.
+        trust: as in `load_policy`.
         render_mode: "rgb_array", or None.
 
     Raises:
-        UserError: as `load_policy`, the policy names a path, or there are recordings only, in which nothing can act.
+        UserError: as in `load_policy`, the policy's task names a path, or it consists of recordings only.
     """
     saved = read_policy(checkpoint)
     task = {"task": saved.config["task"]}

@@ -22,7 +22,7 @@ from vla.io.types import Count, Point, Positive, unique
 Array = np.ndarray
 
 IN_DISTRIBUTION = "seen"  # name of the unchanged condition of an evaluation, which a policy is trained for
-FIRST_SEED = 1_000_000  # of evaluation; collection uses smaller seeds only
+FIRST_SEED = 1_000_000  # smallest seed of evaluations; collection uses smaller seeds only
 LONGEST_INSTRUCTION = 1000  # characters
 
 
@@ -63,10 +63,10 @@ class Spec:
 
     cameras: Cameras
     image_size: tuple[Pixels, Pixels]  # height, width [px]
-    state: Names  # (P,) measured components beside the images
+    state: Names  # (P,) measured components besides the images
     state_units: Units  # (P,) such as "m", "rad", "deg", "m/s", "rad/s" or "1"
     action: Names  # (D,) components
-    units: Units  # (D,) of the action
+    units: Units  # (D,) of the action components
     low: Numbers  # (D,) smallest action
     high: Numbers  # (D,) largest action
     control_hz: Positive  # [Hz]
@@ -98,7 +98,7 @@ class Spec:
 
     @property
     def pose(self) -> list[int]:
-        """Indices of the other state components."""
+        """Indices of the state components that are not rates of change."""
         return [index for index in range(len(self.state)) if index not in self.rates]
 
     def indices(self, names: Iterable[str]) -> list[int]:
@@ -106,7 +106,7 @@ class Spec:
         return [self.state.index(name) for name in names]
 
     def require_robot(self, what: str) -> RobotModel:
-        """Return the robot; a UserError says that `what` needs it if there is none."""
+        """Return the robot; if there is none, a UserError says that `what` needs one."""
         if self.robot is None:
             raise UserError(
                 f"{what} needs a robot, and the spec of this world has none (robot=None): a world gives one in its "
@@ -124,19 +124,19 @@ class Spec:
             )
 
     def given(self, names: Container[str]) -> list[str]:
-        """Return the images that are to be given: all cameras, or the whole picture, if named, in place of parts."""
+        """Return the images to provide: all cameras, or, if `names` contains it, `PICTURE` in place of the cut ones."""
         whole = self.parts and PICTURE in names
         return [PICTURE, *(name for name in self.cameras if name not in self.cut)] if whole else [*self.cameras]
 
     def size(self, image: str) -> tuple[int, int]:
-        """Return height and width [px] in which an image to be given shows as much as those of training."""
+        """Return the height and width [px] at which an image is as detailed as the images in training."""
         if image != PICTURE or not self.parts:
             return self.image_size
         heights, widths = zip(*(part.whole(self.image_size) for part in self.parts), strict=True)
         return max(heights), max(widths)
 
     def images(self, observation: Observation) -> Mapping[str, Array]:
-        """Return camera → image, of which parts that are missing are cut out of the whole picture if it is there."""
+        """Return camera → image; missing parts are cut out of the whole picture if the observation contains it."""
         if PICTURE not in observation.rgb:
             return observation.rgb
         state = dict(zip(self.state, observation.state, strict=False))
@@ -156,7 +156,7 @@ class Spec:
 
     @classmethod
     def from_dict(cls, values: Any, name: str = "the spec") -> Spec:
-        """Invert `to_dict` on untrusted values, which a UserError calls `name` if they are no spec."""
+        """Invert `to_dict` for untrusted values; if they are not a valid spec, a UserError calls them `name`."""
         spec = parse_plain(values, cls, name)
         if problem := next(_contradictions(spec), None):
             raise UserError(f"{name} is damaged or of another kind: {problem}")
@@ -165,7 +165,7 @@ class Spec:
     def require(self, other: Spec, what: str, against: str) -> None:
         """Raise a UserError naming the first field in which the spec of `what` (self) differs from `against`.
 
-        What is unknown to one of them, chain, home or parts, is no difference.
+        A chain, home posture or parts that only one of them knows are not a difference.
         """
         mine, theirs = _fields(self), _fields(other)
         for name, value in mine.items():
@@ -176,7 +176,7 @@ class Spec:
                 )
 
     def require_input(self, other: Spec, what: str, against: str) -> None:
-        """Do as `require` for what a policy sees and does: images that are not cut may have another size."""
+        """Like `require`, for the inputs and outputs of a policy: truth and the size of uncut images are ignored."""
         mine, theirs = self.without_truth, other.without_truth
         (mine if self.parts else replace(mine, image_size=theirs.image_size)).require(theirs, what, against)
 
@@ -237,7 +237,7 @@ class Observation:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], spec: Spec) -> Observation:
-        """Take an observation of gymnasium: an image per camera, "state", "instruction"; a UserError if one lacks."""
+        """Convert a gymnasium observation: images by camera, "state", "instruction"; a UserError if one is missing."""
         cameras = spec.given(values)
         if missing := [name for name in (*cameras, "state", "instruction") if name not in values]:
             raise UserError(f"the observation has {', '.join(map(str, values))}, but lacks {', '.join(missing)}")
@@ -278,7 +278,7 @@ class Episode:
     actions: Array = field(default_factory=_no_rows)  # (N, D) float32, labels for imitation
     executed: Array = field(default_factory=_no_rows)  # (N, D) float32, sent to the robot; see `Stage.step`
     completed: tuple[int, int] | None = None  # instructions completed, of how many; None if there is only one
-    tool: Array | None = None  # (N + 1, 3) its positions [m], the last one at the end; None if the world has none
+    tool: Array | None = None  # (N + 1, 3) tool positions [m], the last one at the end; None if the world has none
 
     @property
     def success(self) -> bool:
@@ -290,11 +290,11 @@ class Environment(Protocol):
     """World that an agent acts in.
 
     It may also have
-        tool: (3,) true position of the tool centre point in a fixed frame [m]; reports then tell paths and smoothness,
+        tool: (3,) true position of the tool centre point in a fixed frame [m]; reports then have path and smoothness,
         events: (step, description) of what the agent did not cause, such as disturbances; recordings mark them,
-        instructions, completed: number of instructions of the current episode, each given when the one before is
-            completed, and how many are; it succeeds when all are, and fails as soon as one does,
-        distinct: a method, range of seeds → number of their different episodes, if some seeds have the same.
+        instructions, completed: number of instructions in the current episode, each given when the previous one is
+            completed, and number completed; the episode succeeds when all are completed, and fails when one fails,
+        distinct: a method, range of seeds → number of distinct episodes, if some seeds give the same episode.
     """
 
     spec: Spec
@@ -328,7 +328,7 @@ class SpecOnly:
 
 @runtime_checkable
 class Multitask(Protocol):
-    """Environment that tells the task of a seed before its episode: collection gives every task as many episodes."""
+    """Environment that knows the task of a seed before its episode, so that collection can balance the tasks."""
 
     tasks: tuple[str, ...]
 
@@ -356,7 +356,7 @@ class TakesJointTargets(Protocol):
     def drive(self, joints: Array, opening: float, seconds: float) -> None:
         """Move towards joint targets (J,) [rad] and a gripper opening 0…1 for `seconds` [s].
 
-        A UserError tells if physics cannot step for so long.
+        Raises a UserError if `seconds` is not a whole number of physics steps.
         """
 
     def judge(self) -> None:
@@ -369,10 +369,10 @@ class TakesJointTargets(Protocol):
 class Agent(Protocol):
     """Source of actions: an expert, a policy, a person.
 
-    One that also has `looks`, whether its next action may depend on the images, gets no others rendered: False while a
-    planned chunk is executed and no new instruction discards it; always False for experts that read the truth. An
-    expert with `memoryless = True` may also label the states that another agent reaches: its action, or the label in
-    `info["clean"]`, depends on the observation alone.
+    An agent may also have `looks`, whether its next action may depend on the images; if not, none are rendered. It is
+    False while a planned chunk is executed and no new instruction discards it, and always for experts that read the
+    truth. An expert with `memoryless = True` may also label states that another agent reaches: its action, or the label
+    in `info["clean"]`, depends on the observation alone.
     """
 
     @property
@@ -389,15 +389,15 @@ class Agent(Protocol):
 
 @runtime_checkable
 class Agents(Protocol):
-    """Agents in several worlds side by side, each in a lane, that share what they compute, as `vla.policy.Policy`."""
+    """Agents in several worlds side by side, one per lane, that share computation, such as `vla.policy.Policy`."""
 
     def reset(self, instruction: str, seed: int, lane: int) -> None:
-        """Start an episode, or a new instruction within it, in a lane; as of `Agent`."""
+        """Start an episode, or a new instruction within it, in a lane; as in `Agent`."""
 
     def act(self, observations: Sequence[Observation], lanes: Sequence[int], /) -> Array:
         """Return the actions (n, D) float32 to execute now in n lanes, given what each of them sees.
 
-        A UserError tells that an observation does not fit; no lane has acted then.
+        Raises a UserError if an observation does not fit the spec; then no lane has acted.
         """
 
     def about(self, lane: int) -> dict[str, Any]:
@@ -434,7 +434,7 @@ class Deployment(Protocol):
     """Execution of a policy outside training; built as `Deployment(**yaml, policy=…, environment=…, output=…)`.
 
     `policy` and `environment` are factories of the checkpoint's policy and its task's environment, `output` a folder. A
-    class with `needs_policy = False` runs without a checkpoint, one with `needs_environment = True` always builds it.
+    class with `needs_policy = False` runs without a checkpoint, one with `needs_environment = True` builds the world.
     """
 
     def run(self) -> Any:

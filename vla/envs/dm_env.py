@@ -16,7 +16,7 @@ from vla.spec import FIRST_SEED, Array, Environment, Observation
 class DmEnvironment(dm_env.Environment):
     """Adapter of an `Environment` to dm_env.
 
-    An observation is that of `vla.envs.gym.GymEnvironment`, with the `instruction` as an array of one string. The
+    Observations are those of `vla.envs.gym.GymEnvironment`, with the `instruction` as a 0-d array of a string. The
     reward is 1 for the step that succeeds, else 0; the discount is 0 after success and failure, and 1 after a timeout.
     """
 
@@ -44,7 +44,7 @@ class DmEnvironment(dm_env.Environment):
         return dm_env.truncation(0.0, observation) if self._over else dm_env.transition(0.0, observation)
 
     def observation_spec(self) -> dict[str, specs.Array]:
-        """Return shapes and types of an observation."""
+        """Return the shapes and dtypes of an observation."""
         spec = self.environment.spec
         return {
             **{camera: specs.BoundedArray((*spec.image_size, 3), np.uint8, 0, 255, camera) for camera in spec.cameras},

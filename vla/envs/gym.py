@@ -18,7 +18,7 @@ LETTERS = "".join(filter(str.isprintable, map(chr, range(0x10000))))  # of an in
 
 
 class Sentence(Text):
-    """Space of instructions; its text names no characters, of which there are 60 000."""
+    """Space of instructions; its `repr` omits the 60 000 characters that they may contain."""
 
     def __init__(self) -> None:
         super().__init__(LONGEST_INSTRUCTION, min_length=0, charset=LETTERS)
@@ -65,7 +65,7 @@ class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
         """Apply one (D,) action for one control period."""
         observation = self._arrays(self.environment.step(action))
         outcome, done = self.environment.outcome, self.environment.done
-        ended = outcome == "success" or (done and outcome == "failure")  # which no time limit is
+        ended = outcome == "success" or (done and outcome == "failure")  # a time limit truncates instead
         return observation, float(outcome == "success"), ended, done and not ended, self._info()
 
     def render(self) -> Array | None:

@@ -1,7 +1,7 @@
-"""Observations under the names of LeRobot, in both directions. LeRobot itself is not needed.
+"""Conversion of observations to and from LeRobot's names. LeRobot itself is not needed.
 
-The state of LeRobot is the pose. Rates of change, of which its policies would make inputs of their own accord, are
-separate: `observation.velocities`.
+LeRobot's state is the pose. Rates of change are separate, as `observation.velocities`, because LeRobot's policies use
+all of the state as an input.
 
 Shapes: B observations, P components of the state, H by W pixels.
 """
@@ -19,14 +19,14 @@ from vla.io.errors import UserError
 from vla.io.parts import PICTURE
 from vla.spec import FIRST_SEED, Array, Observation, Spec
 
-IMAGES, IMAGE = "observation.images.", "observation.image"  # of cameras, and of an environment with one
+IMAGES, IMAGE = "observation.images.", "observation.image"  # prefix of cameras, and key of a single camera
 STATE, RATES = "observation.state", "observation.velocities"
 TASK = "task"  # the instructions
 AGENT = {STATE: "agent_pos", RATES: "velocities"}  # what an environment calls them, before LeRobot renames them
 
 
 class LeRobotEnvironment(Task):
-    """A task of the config as the environments that LeRobot evaluates policies in.
+    """A task of the config as an environment in which LeRobot evaluates policies.
 
     An observation has `pixels`, camera → (H, W, 3) uint8, `agent_pos`, the pose, and `velocities`, the rates of change,
     if the state has any, both float32. `info` has `is_success` only.
@@ -35,7 +35,7 @@ class LeRobotEnvironment(Task):
     def __init__(self, task: str, longest: int, options: Mapping[str, Any]) -> None:
         """Build an option of the group `task` with `options`, see `vla.config.compose.compose_task`.
 
-        LeRobot ends an episode that has not ended itself after `longest` steps.
+        LeRobot truncates an episode after `longest` steps.
         """
         super().__init__(task, "rgb_array", **options)
         self.vla_spec = self.environment.spec
@@ -48,9 +48,9 @@ class LeRobotEnvironment(Task):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode of evaluation: that of `seed`; a seed of training, as LeRobot's default, counts from there.
+        """Start the evaluation episode of `seed`, or of a drawn seed if it is None.
 
-        Without a seed one is drawn.
+        To seeds of training, such as LeRobot's default ones, `FIRST_SEED` is added.
         """
         given = int(self.np_random.integers(FIRST_SEED)) if seed is None else seed
         return super().reset(seed=given + FIRST_SEED * (given < FIRST_SEED), options=options)
@@ -66,7 +66,7 @@ class LeRobotEnvironment(Task):
 
 
 def arrays(observation: Observation, spec: Spec) -> dict[str, Array]:
-    """Convert an observation to what a LeRobot dataset has of a step, float32, images (3, H, W) from 0 to 1."""
+    """Convert an observation to a step as in LeRobot's datasets: float32, images (3, H, W) from 0 to 1."""
     images = {
         f"{IMAGES}{name}": np.ascontiguousarray(observation.rgb[name].transpose(2, 0, 1)) / np.float32(255)
         for name in spec.cameras
@@ -75,12 +75,12 @@ def arrays(observation: Observation, spec: Spec) -> dict[str, Array]:
 
 
 def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
-    """Convert a batch of LeRobot's to observations.
+    """Convert a LeRobot batch to observations.
 
     Args:
-        batch: `observation.images.CAMERA` (B, 3, H, W) from 0 to 1, or `observation.image`, the only camera's or the
-            one of which cameras show parts; `observation.state` and `observation.velocities` (B, …) arrays, and
-            `task`, B instructions.
+        batch: `observation.images.CAMERA` (B, 3, H, W) from 0 to 1, or `observation.image`, that of the only camera or
+            the whole picture of which cameras show parts; `observation.state` and `observation.velocities` (B, …)
+            arrays, and `task`, B instructions.
         spec: of the policy.
 
     Raises:
@@ -88,7 +88,7 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
     """
     parts = _parts(spec)
     given = spec.given([PICTURE] if IMAGE in batch else [])
-    single = given if IMAGE in batch and len(given) == 1 else []  # of the batch and of the policy
+    single = given if IMAGE in batch and len(given) == 1 else []  # the only image of batch and policy
     keys = {name: IMAGE if name in (PICTURE, *single) else f"{IMAGES}{name}" for name in given}
     needed = [*keys.values(), *parts, TASK]
     if missing := [key for key in needed if key not in batch]:

@@ -26,7 +26,7 @@ TOLERANCE = 1e-4  # [m] and [rad]
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """Facts of an arm that inverse kinematics needs."""
+    """Model of an arm for inverse kinematics."""
 
     # Joints (J,) → pose (4, 4) of the tool in the base frame [m], and Jacobian (6, J), linear [m/rad] above angular.
     forward: Callable[[Array], tuple[Array, Array]]
@@ -67,7 +67,7 @@ def solve(arm: Kinematics, target: Array, joints: Array, start: tuple[Array, Arr
     """Find joints near `joints` (J,) that bring the tool centre point to the (4, 4) pose `target`.
 
     By damped least squares (Nakamura and Hanafusa, "Inverse kinematic solutions with singularity robustness for robot
-    manipulator control", 1986), with the home posture in their null space. Unreachable poses are approached as far as
+    manipulator control", 1986), pulled to the home posture in null space. Unreachable poses are approached as far as
     the joint limits allow. `start` is the result of `arm.forward(joints)`, where it is known.
     """
     joints = joints.copy()

@@ -1,4 +1,4 @@
-"""Forward kinematics of any serial arm in plain numpy; `vla.models.kinematics` has that of networks.
+"""Forward kinematics of any serial arm in plain numpy; `vla.models.kinematics` has the one in torch.
 
 Chains are as in `vla.spec.RobotModel`, (J + 1, 7).
 """

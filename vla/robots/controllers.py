@@ -111,8 +111,8 @@ def acts_on_joints(spec: Spec) -> bool:
 
 
 def recorded_controller(spec: Spec) -> CartesianController | JointController:
-    """Build the controller for recorded actions, without a limit of the workspace (UserError: the arm or the actions
-    are of another kind)."""
+    """Build the controller for recorded actions, without limits of the workspace (UserError: no arm, unknown
+    kinematics, or actions of another kind)."""
     return controller_for(spec, None if acts_on_joints(spec) else ((-math.inf,) * 3, (math.inf,) * 3))
 
 

@@ -66,7 +66,7 @@ def forward(joints: Array) -> tuple[Array, Array]:
     x, y = _LINKS[:, :, 0], _LINKS[:, :, 1]
     moved[:, :, 0], moved[:, :, 1] = cosine * x + sine * y, cosine * y - sine * x
     for index in range(1, 7):
-        moved[index] = moved[index - 1].dot(moved[index])  # of matrices this small, in half the time of np.matmul
+        moved[index] = moved[index - 1].dot(moved[index])  # half the time of np.matmul for such small matrices
     pose = moved[6] @ _TOOL
     # A joint's own rotation changes neither its axis nor its origin.
     (ax, ay, az), (x, y, z) = moved[:, :3, 2].T, pose[:3, 3:] - moved[:, :3, 3].T

@@ -12,7 +12,7 @@ from vla.io.errors import UserError
 from vla.parallel.processes import WORKER, without_triton
 
 WORKING_BACKEND = "VLA_GL_WORKS"  # the backend that worked in a probe, inherited by child processes
-FAILED_BACKENDS = "VLA_GL_FAILS"  # those that did not
+FAILED_BACKENDS = "VLA_GL_FAILS"  # the backends that did not work
 NO_BACKEND = "disabled"
 PROBE = "import mujoco; mujoco.GLContext(8, 8).make_current()"
 EGL_WORKS = "VLA_EGL_WORKS"  # whether the fast renderer can run, found by a probe, inherited by child processes
@@ -34,10 +34,10 @@ for number, device in enumerate(egl.eglQueryDevicesEXT()):
 
 
 def choose_backend() -> None:
-    """Set MUJOCO_GL on Linux: GLFW with a display, else EGL, OSMesa if that fails, too, "disabled" if all fail.
+    """Set MUJOCO_GL on Linux to the first that works of GLFW (with a display), EGL and OSMesa, else to "disabled".
 
-    A backend that the user has set is only probed. Triton is blocked or loaded now: after Mesa's renderer its LLVM
-    would use parts of Mesa's and crash.
+    If the user has set a backend, only that one is probed. Triton is blocked or imported first: after Mesa's renderer,
+    its LLVM would use parts of Mesa's and crash.
     """
     without_triton()
     with suppress(ImportError):
@@ -54,9 +54,9 @@ def choose_backend() -> None:
 
 
 def choose_device() -> None:
-    """Let the worker processes of a machine with several GPUs take turns on them, for both renderers.
+    """Assign the worker processes to the GPUs of this machine, round-robin, for both renderers.
 
-    A device that the user has set, MUJOCO_EGL_DEVICE_ID, stays.
+    A device that the user has set by MUJOCO_EGL_DEVICE_ID is kept.
     """
     chosen = os.environ.get("MUJOCO_EGL_DEVICE_ID")
     if chosen is None and (devices := _egl_devices()):
@@ -67,7 +67,7 @@ def choose_device() -> None:
 
 
 def _egl_devices() -> list[str]:
-    """Return the numbers of the GPUs that EGL can draw on; none of a machine with a single one."""
+    """Return the numbers of the GPUs that EGL can draw on; an empty list on a machine with a single GPU."""
     if EGL_DEVICES not in os.environ:
         several = len([*Path("/dev").glob("nvidia[0-9]*"), *Path("/dev/dri").glob("renderD*")]) > 1
         os.environ[EGL_DEVICES] = _output(DEVICES_PROBE, MUJOCO_GL="egl") or "" if several else ""

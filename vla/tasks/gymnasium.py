@@ -28,11 +28,11 @@ PATHS = (f"{OBSERVATION}.", f"{INFO}.")
 
 
 class Gymnasium(World):
-    """A gymnasium environment, of whose observation and `info` a mapping takes images, state, truth and success.
+    """A gymnasium environment, with images, state, truth and success taken from its observation, `info` or rendering.
 
     A value is named by a dotted path: `observation.pixels.top` is the entry `top` of the entry `pixels` of the
-    observation, `info.is_success` one of the dictionary `info`, `render` what `render()` returns. `observation` alone
-    is an observation that is an array. An episode ends with its first success, or when the environment ends it.
+    observation, `info.is_success` an entry of the dictionary `info`, `render` what `render()` returns. `observation`
+    names an observation that is an array. An episode ends with its first success, or when the environment ends it.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Gymnasium(World):
                 that a file names must be trusted.
             id: registered name, such as "gym_pusht/PushT-v0".
             options: further arguments of `gymnasium.make`.
-            steps: of an episode, at most; None: as registered.
+            steps: maximum number of steps of an episode; None: as registered.
             control_hz: rate of actions [Hz]; None: the `render_fps` of the environment.
             instruction: of every episode, or a path that begins with "observation." or "info.".
             images: camera → path of its image, (H, W, 3) uint8 of any size.
@@ -68,9 +68,9 @@ class Gymnasium(World):
                 ratio, as imported demonstrations are.
             state: path of an array → names of its components; None: numbered.
             action: names of the components of an action; None: numbered.
-            units: of all components of state and action, or of some by name; "1" without a unit, or if unknown.
-            low, high: bounds of the action, to which it is clipped, of all components or one each; None: those of the
-                action space.
+            units: one unit for all components of state and action, or name → unit for some; "1": none, or unknown.
+            low, high: bounds to which actions are clipped, one for all components or one per component; None: those of
+                the action space.
             success: path of the flag that is true in a successful step.
             truth: name → path of an array, for training and experts only.
 
@@ -110,10 +110,10 @@ class Gymnasium(World):
             truth=tuple((name, np.size(_get(values, path))) for name, path in self._truth.items()),
         )
         self.spec = Spec.from_dict(spec.to_dict(), f"task.id={id}")
-        self._observe(values)  # refuses images that are none
+        self._observe(values)  # raises if an image is of another shape or type
         if not success.startswith(PATHS):
             raise UserError(f"task.success={success} must be a path that begins with {' or '.join(PATHS)}")
-        self._success_reported = False  # in a step, or its absence in the log
+        self._success_reported = False  # whether a step had the flag, or the log has told that none had
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`, which seeds the environment."""
@@ -154,7 +154,7 @@ class Gymnasium(World):
 
 
 def _make(package: str, id: str, options: Mapping[str, object], steps: int | None, render: bool) -> Any:
-    """Make the environment, which must be a class of the package: a file is trusted by the package that it names."""
+    """Make the environment, whose class must be in the package: a config file is trusted for the package it names."""
     choose_backend()  # before the package imports MuJoCo
     try:
         import_module(package)
@@ -182,7 +182,7 @@ def _make(package: str, id: str, options: Mapping[str, object], steps: int | Non
 
 
 def _bound(name: str, given: Numbers | float | None, own: Array) -> tuple[float, ...]:
-    """Return the low or high bounds of an action, as given or else of its space; a UserError if they do not fit it."""
+    """Return the low or high bounds of an action, by default those of its space; a UserError if they do not fit it."""
     if given is None:
         bound = tuple(float(str(value)) for value in own)  # 0.1, not the 0.10000000149 of float32
     else:
@@ -208,7 +208,7 @@ def _get(values: Any, path: str, *default: Any) -> Any:
 
 
 def _labels(paths: Sequence[str]) -> Sequence[str]:
-    """Return the last parts of dotted paths, or as much of them as tells them apart."""
+    """Return the last part of each dotted path, or more of the paths if those are not distinct."""
     for labels in ([path.rpartition(".")[2] for path in paths], [path.partition(".")[2] for path in paths]):
         if len({*labels}) == len(labels):
             return labels
@@ -216,7 +216,7 @@ def _labels(paths: Sequence[str]) -> Sequence[str]:
 
 
 def _named(path: str, values: Any, names: Names | None, label: str) -> tuple[str, ...]:
-    """Return the names of an array's components, by default numbered labels; a UserError if there are not as many."""
+    """Return the names of an array's components, by default numbered labels; a UserError if their number differs."""
     size = np.size(values)
     if names is None:
         return tuple(f"{label}_{index}" for index in range(size))

@@ -49,7 +49,7 @@ class Perturbation:
     pace: PositiveRange
 
     def __post_init__(self) -> None:
-        """Require corners with a coordinate per component of `move`."""
+        """Check that the corners have one coordinate per component of `move`."""
         low, high, move = len(self.low), len(self.high), len(self.move)
         if not low == high == move:
             raise UserError(f"expert.perturb has {low} numbers in low, {high} in high, {move} in move")
@@ -112,9 +112,9 @@ class Perturbed:
     """An expert with perturbed actions; `info["clean"]` is the expert's own action, the label to imitate."""
 
     def __init__(self, spec: Spec, expert: Callable[..., Agent], perturb: Perturbation) -> None:
-        """Perturb the expert that `expert` makes for `spec`, that of the environment."""
+        """Perturb the expert that `expert` makes for `spec`, the spec of the environment."""
         self._spec, self._expert, self._perturb = spec, expert(spec=spec), perturb
-        self.memoryless = bool(getattr(self._expert, "memoryless", False))  # of the label
+        self.memoryless = bool(getattr(self._expert, "memoryless", False))  # true of the label
         self.looks = bool(getattr(self._expert, "looks", True))
         self.info: dict[str, Any] = {}
 

@@ -14,8 +14,8 @@ from vla.spec import Cameras, Names, Numbers, RobotModel, Spec, SpecOnly
 def units_of(
     units: str | Mapping[str, str], state: Sequence[str], action: Sequence[str]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the units of the components of state and action, given one of all, or those of some by name, where the
-    others have "1"; a UserError if a name is of no component."""
+    """Return the units of all components of state and action. `units` is one unit for all, or name → unit for some,
+    where the others get "1"; a UserError if there is no component of such a name."""
     if isinstance(units, str):
         return (units,) * len(state), (units,) * len(action)
     if unknown := [name for name in units if name not in (*state, *action)]:
@@ -33,10 +33,10 @@ class Recorded(SpecOnly):
         control_hz: rate of the steps [Hz].
         state: names of its components.
         action: names of its components.
-        units: of all components of state and action, or of some by name; "1" without a unit, or if unknown.
+        units: one unit for all components of state and action, or name → unit for some; "1": none, or unknown.
         low, high: bounds of the action.
-        joints: components that are positions of the robot's joints, base to tip; "all": all of the action; None: no
-            deployment as a ROS 2 node.
+        joints: components that are positions of the robot's joints, base to tip; "all": all components of the action;
+            None: no deployment as a ROS 2 node.
 
     Raises:
         UserError: arguments contradict each other, or a joint has no unit of a position.

@@ -17,7 +17,7 @@ Scene = TypeVar("Scene")
 
 
 class World:
-    """Base class of worlds, with what `vla.spec.Environment` says of an episode; none has begun.
+    """Base class of worlds, with the attributes of an episode in `vla.spec.Environment`; at first, none has begun.
 
     A world draws no images while `_blind` is true.
     """
@@ -44,9 +44,9 @@ class World:
 
 
 class ManyTasks(World):
-    """Base class of worlds with several `tasks`, which seeds take in turn, in scenes that are made when first played.
+    """Base class of worlds with several `tasks`, through which seeds cycle, in scenes that are made when first played.
 
-    Where memory is scarce, a new scene replaces the newest: the oldest ones are needed first.
+    When memory is scarce, a new scene replaces the newest one: in the cycle, the oldest scenes are needed again first.
     """
 
     tasks: tuple[str, ...]

@@ -7,9 +7,9 @@ import numpy as np
 
 from vla.spec import Array
 
-# robosuite/controllers/config/osc_pose.json, robosuite/models/grippers/panda_gripper.py, and for the posture, which is
-# another than robosuite's, libero/envs/robots/mounted_panda.py
-HOME = np.array([0, -0.161037389, 0, -2.44459747, 0, 2.2267522, np.pi / 4])  # where the null space pulls to [rad]
+# robosuite/controllers/config/osc_pose.json, robosuite/models/grippers/panda_gripper.py, and for the posture, which
+# differs from robosuite's, libero/envs/robots/mounted_panda.py
+HOME = np.array([0, -0.161037389, 0, -2.44459747, 0, 2.2267522, np.pi / 4])  # reference posture of the null space [rad]
 STIFFNESS, POSTURE = 150.0, 10.0  # of the hand and of the null space [1/s²]; both damped critically
 DAMPING, POSTURE_DAMPING = 2 * np.sqrt(STIFFNESS), 2 * np.sqrt(POSTURE)
 REACH = np.array([0.05] * 3 + [0.5] * 3)  # of a full command [m, rad]
@@ -18,10 +18,10 @@ GRIPPER_RATE = 0.01  # of the range -1…1 per substep: eight actions from open 
 
 
 class Controller:
-    """Turns actions into torques, in every substep anew.
+    """Computes torques from an action, anew in every substep.
 
-    A goal is relative to where the hand is, not to the goal before, so displacements do not add up; without a rotation
-    the goal's rotation stays. Only the sign of the gripper's command counts: it opens or closes at one speed.
+    A goal is relative to the hand's current pose, not to the previous goal, so displacements do not accumulate; an
+    action without rotation keeps the goal's rotation. Only the sign of the gripper command counts: its speed is fixed.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -46,7 +46,7 @@ class Controller:
         """Start an episode.
 
         LIBERO's controller does not notice that an initial state replaces the home posture: the first goal is relative
-        to that posture's hand, the first torque is computed there, and its rotation is held until an action turns.
+        to the hand in that posture, the first torque is computed there, and its rotation is held until an action turns.
         """
         self._turned = self._home.site_xmat[self.site].reshape(3, 3).copy()
         self._goal = self._home.site_xpos[self.site].copy()
@@ -71,7 +71,7 @@ class Controller:
             mujoco.mj_step2(self._model, data)
 
     def _torques(self, data: mujoco.MjData) -> Array:
-        """Return the motors' torques (7,) [N m] without those against gravity and Coriolis forces."""
+        """Return the motors' torques (7,) [N m] without the compensation of gravity and Coriolis forces."""
         arm = self._arm
         mujoco.mj_jacSite(self._model, data, self._jacobian[:3], self._jacobian[3:], self.site)
         mujoco.mj_fullM(self._model, data, self._mass)

@@ -29,18 +29,18 @@ STEPS = {
     "openpi": {"spatial": 220, "object": 280, "goal": 300, "long": 520},
 }
 WAIT = np.array([0.0] * 6 + [-1.0])  # the command while things settle: stay, and open the gripper
-END = 2 * FIRST_SEED  # of the seeds with official states; those that select weights come after it
-TINTED = 0.5  # share of the things with another colour, in starts that have such things
+END = 2 * FIRST_SEED  # of the seeds with official states; the seeds that select weights follow
+TINTED = 0.5  # probability that a thing has another colour, in starts with other colours
 TINT = 0.2, 1.0  # range of the factors of red, green and blue
 
 Numbers = Annotated[list[Annotated[int, Ge(0), Le(9)]], MinLen(1), Predicate(unique)]
 
 
 class Libero(ManyTasks):
-    """Tasks of a Panda on a table, a floor or in a kitchen, one of them per episode: seeds take them in turn.
+    """Tasks of a Panda on a table, a floor or in a kitchen, one of them per episode: seeds cycle through them.
 
-    Success is the first step that LIBERO calls one; an episode ends with it, or when its steps are used up. The state
-    is the position of the grip and the rotation vector of the hand in the world's frame, and the fingers' positions. An
+    An episode ends at the first step that LIBERO counts as a success, or when its steps are used up. The state is the
+    position of the grip and the rotation vector of the hand in the world's frame, and the fingers' positions. An
     action is a displacement and a rotation vector of the hand, in the world's axes and relative to where it is, and the
     gripper's opening; the controller reaches about a quarter of a displacement within a step.
     """
@@ -68,10 +68,10 @@ class Libero(ManyTasks):
             renderer: renderer of the images.
             image_size: height and width of every camera's images [px].
             cameras: names of cameras, such as "agentview" and "robot0_eye_in_hand".
-            mirror: whether images are mirrored left to right, as those are that published policies were trained with.
+            mirror: whether images are mirrored left to right, like those that published policies were trained on.
             detail: of meshes and textures.
             randomize: what else differs between drawn starts.
-            steps: whose limits of an episode's steps.
+            steps: whose limits on the steps of an episode apply, LeRobot's or openpi's.
             settle: steps before the first observation, in which things come to rest.
             tiers: suite → tasks, or patterns such as goal*_3, for reports.
 
@@ -79,7 +79,7 @@ class Libero(ManyTasks):
             UserError: the wheels are missing, or there is no such suite.
         """
         super().__init__()
-        folders()  # now, because an evaluation takes the error of a reset for that of one episode
+        folders()  # raise now, because an evaluation attributes an error in `reset` to that episode
         chosen = range(10) if tasks is None else tasks
         suites = dict.fromkeys(
             name for each in ([suite] if isinstance(suite, str) else suite) for name in suites_of(each)
@@ -102,7 +102,7 @@ class Libero(ManyTasks):
         )
 
     def distinct(self, seeds: range) -> int:
-        """Return the number of different episodes of seeds: after a while the official states come again."""
+        """Return the number of distinct episodes of seeds: each task has only `STATES` official states."""
         official = range(max(seeds.start, FIRST_SEED), min(seeds.stop, END))
         return len(seeds) - max(0, len(official) - STATES * len(self._tasks))
 
@@ -119,7 +119,7 @@ class Libero(ManyTasks):
         scene = self._scene = self._scene_of(task.scene, lambda: Scene(task, self._renderer, self.spec, self._detail))
         starts, self._goal = scene.started(task)
         state = (seed - FIRST_SEED) // len(self._tasks) % STATES if FIRST_SEED <= seed < END else None
-        # Each its own, so that one share changes nothing but what it is of.
+        # One generator each, so that changing a share does not change the other draws.
         random, places, colours = (np.random.default_rng(key) for key in (seed, [seed, 4], [seed, 5]))
         exchanged = state is None and places.random() < self._randomize.places
         coloured = state is None and colours.random() < self._randomize.colours
@@ -181,13 +181,13 @@ class Scene:
         known = [model.camera(number).name for number in range(model.ncam)]
         if unknown := [name for name in spec.cameras if name not in known]:
             raise UserError(f"task.cameras names {', '.join(unknown)}; LIBERO has {', '.join(known)}")
-        model.mat_reflectance[:] = 0  # of the renderers none draws it
+        model.mat_reflectance[:] = 0  # no renderer draws reflections
         self._burners = [n for n in range(model.nsite) if model.site(n).name.endswith(BURNER)]
         self._knobs = [
             model.jnt_qposadr[model.joint(f"{model.site(n).name.removesuffix(BURNER)}_button").id]
             for n in self._burners
         ]
-        model.site_rgba[:, 3] = 0  # marks of regions, not to be seen
+        model.site_rgba[:, 3] = 0  # sites only mark regions
         self._colours, self._materials = model.mat_rgba.copy(), _materials(model, task)
         cameras = [known.index(name) for name in spec.cameras]
         views = Views(cameras, *spec.image_size, geom_groups=(VISIBLE,), site_groups=tuple(range(6)))

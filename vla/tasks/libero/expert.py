@@ -1,7 +1,7 @@
 """A planner for LIBERO that knows the truth: a memoryless closed-loop controller of a few skills.
 
 Its action depends on the present state alone, so every action is a valid label for its state. What must be done next is
-read from the goal's predicates; where to grasp is computed from what collides, not from a table of things.
+read from the goal's predicates; where to grasp is computed from collision geometry, not from a table of things.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from vla.tasks.libero.skills import TWIST, approach, carry, command, drag, let_g
 
 DRAWERS = ("wooden_cabinet", "white_cabinet", "yellow_cabinet")  # what must be open for something to be put in
 HOLLOWS = (*DRAWERS, "microwave")  # into which things are brought all the way
-SLIPPED = 0.03  # by which a drawer may close while something is brought into it, before that is let go [m]
-ARRIVED = 0.015  # distance at which they are [m]
-NARROW = 0.006  # room about the hand below which a thing under something else is first dragged out [m]
+SLIPPED = 0.03  # by how much a drawer may close while a thing is brought into it, before the thing is let go [m]
+ARRIVED = 0.015  # distance from its place at which a thing is all the way in [m]
+NARROW = 0.006  # free room around the hand below which a thing under another one is first dragged out [m]
 
 
 class Planner:
@@ -94,7 +94,7 @@ def _open_fingers(at: Situation) -> Array:
 
 
 def _release(at: Situation, held: str | None) -> Array:
-    """Let go of what needs nothing more, once it lies where the goal wants it."""
+    """Let go of a thing that needs nothing more, once it lies where the goal requires it."""
     done = next((part for part in at.goal.parts if part.thing == held), None)
     if done is not None and done.name == "in" and at.subject(done.place).startswith(HOLLOWS):
         place = place_of(at, done.thing, done.place, True)
@@ -117,7 +117,7 @@ def _deliver(at: Situation, thing: str, where: str, held: bool) -> Array:
 
 
 def _shut(at: Situation, place: str, slack: float) -> bool:
-    """Return whether a place is in a drawer that must be opened first, less open than it must be by `slack` [m]."""
+    """Return whether a place is in a drawer that must be opened first; it may lack `slack` [m] of being open."""
     if place in at.goal.bodies or not at.subject(place).startswith(DRAWERS):
         return False
     joints = at.goal.joints(place)

@@ -18,9 +18,9 @@ DOORS = {
     "microwave": (-1.3, -0.005),
 }
 STOVE_ON, STOVE_OFF = 0.5, 0.0  # turn of the knob at which it is on, and below which it is off: not yet at 0 [rad]
-NEAR = 0.03  # largest distance from the middle of a thing to lie on [m]
-OVER = (-0.005, 0.10)  # height over the upper side of a region to lie on [m]
-SLACK = 0.01  # depth under the box of a region to lie in [m]
+NEAR = 0.03  # largest horizontal distance between a thing and the one that it lies on [m]
+OVER = (-0.005, 0.10)  # height above the upper side of a region at which a thing is on it [m]
+SLACK = 0.01  # depth below the box of a region at which a thing is still in it [m]
 ORDER = ("open", "turnon", "on", "in", "close", "turnoff")  # in which parts of a goal can be done
 
 
@@ -83,14 +83,14 @@ class Goal:
             return bool(gap[2] >= 0 and np.hypot(*gap[:2]) < NEAR) and self.touch(data, body, support)
         site = self.sites[place]
         size = self._model.site_size[site]
-        # LIBERO turns by the matrix of the site, where its transpose was meant.
+        # Like LIBERO, which multiplies by the site's matrix where its transpose was meant.
         gap = data.site_xmat[site].reshape(3, 3) @ (data.xpos[body] - data.site_xpos[site])
         over = size[2] + OVER[0] < gap[2] < size[2] + OVER[1] and bool((np.abs(gap[:2]) < size[:2]).all())
         owner = self.owner[self._model.site_bodyid[site]]  # 0: a part of the table, which needs no touch
         return over and (owner == 0 or self.touch(data, body, owner))
 
     def _in(self, data: mujoco.MjData, body: int, place: str) -> bool:
-        """Return whether the body's origin is in the region, wherever it is held."""
+        """Return whether the body's origin is in the region, even if the gripper holds it."""
         site = self.sites[place]
         size = np.abs(data.site_xmat[site].reshape(3, 3) @ self._model.site_size[site])
         gap = data.xpos[body] - data.site_xpos[site]

@@ -1,4 +1,4 @@
-"""Where to grasp a thing, computed from the points on its surface and on what stands about."""
+"""Where to grasp a thing, computed from points on its surface and on the surfaces around it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FINGER, OPEN, THICK = 0.012, 0.037, 0.02  # half of a finger's breadth, its dist
 RIDGE = 0.02  # radius of what counts as the highest part of a thing [m]
 UPRIGHT = 0.9  # least cosine of the tilt of a thing that stands
 TOUCHING = 0.02  # room at which the hand most likely hits something [m]
-SQUARE = 0.9  # least cosine between the way in which fingers close and the normal of a wall
+SQUARE = 0.9  # least cosine between the direction in which the fingers close and the normal of a wall
 KINDS = (0.0, 0.08, 0.10, 0.12)  # costs of grasps across a thing, by a wall, by a narrow part and leaning
 LEAN = 0.45  # of the hand where something stands in its way [rad]
 YAWS = np.radians(np.arange(-90, 90, 15))
@@ -37,15 +37,15 @@ class Grasp:
 
 
 def choose_grasp(at: Situation, thing: str, place: Place) -> Grasp | None:
-    """Return the cheapest grasp from above of a thing that goes to a place; None: there is none."""
+    """Return the cheapest grasp from above of a thing to be brought to a place; None if there is none."""
     points = at.points(thing)
     tilted = np.abs(at.data.xmat[at.goal.bodies[thing], 6:]).max() < UPRIGHT  # whichever of its axes is up
     kinds = (crest(points),) if tilted else (across(points), walls(points), parts(at.pieces(thing)), leaning(points))
     best: Grasp | None = None
-    lowest_cost = hindered = math.inf  # of the best one, with the way there and its width, and without
+    lowest_cost = hindered = math.inf  # cost of the best one, and the part of it that is due to its kind and obstacles
     for least, kind in zip(KINDS, kinds, strict=False):
         if hindered < least:
-            break  # what is in its way costs less than another kind
+            break  # its obstacles cost less than another kind of grasp
         if not (fitting := [(width, grasp) for width, grasp in kind if gap_of(grasp, points) > 0]):
             continue
         widths, grasps = zip(*fitting, strict=True)
@@ -65,7 +65,7 @@ def room_of(at: Situation, thing: str, grasp: Grasp) -> float:
 
 
 def _costs(at: Situation, thing: str, grasps: Sequence[Grasp], place: Place) -> tuple[Array, Array]:
-    """Return costs (K,) of how far the hand must turn, and of what hinders it where it grasps and where it lets go."""
+    """Return costs (K,) of the motion of the hand, and of what hinders it where it grasps and where it lets go."""
     here = np.array([grasp.position for grasp in grasps])
     yaws, leans = np.array([grasp.yaw for grasp in grasps]), np.array([grasp.lean for grasp in grasps])
     there = place.spot + (here - at.origin(thing)) @ rotation_z(place.turn).T
@@ -80,7 +80,7 @@ def _costs(at: Situation, thing: str, grasps: Sequence[Grasp], place: Place) -> 
 
 
 def _hindrances(at: Situation, thing: str, spots: Array, yaws: Array, leans: Array) -> Array:
-    """Return costs (K,) of what is close to the hand, or far from the arm, at places (K, 3) [m]."""
+    """Return costs (K,) of obstacles close to the hand at places (K, 3) [m], and of reaching these places."""
     middle = (spots.max(axis=0) + spots.min(axis=0)) / 2
     others = at.others(thing, middle, float(np.ptp(spots[:, :2], axis=0).max()) / 2 + HAND + CLEAR)
     gaps = clearance(spots, yaws, others, leans)
@@ -88,7 +88,7 @@ def _hindrances(at: Situation, thing: str, spots: Array, yaws: Array, leans: Arr
 
 
 def across(points: Array) -> Iterator[tuple[float, Grasp]]:
-    """Yield width [m] and grasp over all of a thing."""
+    """Yield width [m] and grasp across a whole thing."""
     bottom, top = points[:, 2].min(), points[:, 2].max()
     height = max(top - PALM, bottom + TIP + 0.003)
     ring = points[np.abs(points[:, 2] - height) < 0.012]

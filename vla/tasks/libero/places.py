@@ -16,16 +16,16 @@ TIGHT = 0.009  # the same where there is none [m]
 MARGIN = 0.008  # between a thing and what stands about its place [m]
 ASIDE = 0.012  # between a thing and a drawer that is to be opened [m]
 SLIT = 0.008  # between a thing and what it passes [m]
-PUSHED = 0.06  # by which other things may be pushed by one that is dragged [m]
-SQUARE = 0.01  # edge of the squares in which one point stands for all that are over each other [m]
-STAY, REACHED = 0.5, 0.05  # cost per metre of a place from where the thing is, up to a distance: the choice then stays
-FLOOR = 0.012  # height over the floor of a region of what is in the way there [m]
-THICK = 0.03  # largest height of what carries things over the middle of a flat region [m]
+PUSHED = 0.06  # by how much a dragged thing may push others [m]
+SQUARE = 0.01  # edge of the cells of a horizontal grid, each of which keeps one point [m]
+STAY, REACHED = 0.5, 0.05  # cost per metre from where the thing is, up to this distance [m], so that the choice stays
+FLOOR = 0.012  # smallest height of an obstacle above the floor of a region [m]
+THICK = 0.03  # largest height of a support above the middle of a flat region [m]
 GRID = np.stack(np.meshgrid(*[np.linspace(-0.8, 0.8, 7)] * 2), axis=-1).reshape(-1, 2)
 WAYS = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(16) * np.pi / 8])  # out from under a roof
 OBLIQUE = np.where(np.arange(len(WAYS)) % 4, 0.1, 0.0)  # costs of ways that are not along a wall [m]
 ROUND = 0.7  # least ratio of the variances along both sides of a thing that is not turned to be put down
-ROOFED = 0.05  # cost of a place wholly under a roof
+ROOFED = 0.05  # cost of a roof over a place, per unit of `_Form.room`
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Place:
 
 
 def place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
-    """Return where to put a thing down on another one or on or in a region; `held`: the hand has it."""
+    """Return where to put a thing down on another one, or on or in a region; `held`: whether the hand holds it."""
     place = _place_of(at, thing, where, held)
     before = at.origin(thing) - place.spot
     entering = place.out is not None and np.linalg.norm(before) < np.linalg.norm(place.out) + 0.03
@@ -48,13 +48,13 @@ def place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
 
 
 def _hidden(at: Situation, thing: str, held: bool) -> Array | None:
-    """Return the displacement (3,) [m] of a thing to where nothing is over it; None: nothing is."""
+    """Return the displacement (3,) [m] of a thing to where nothing is over it; None: nothing is, or it is blocked."""
     rest = at.others(thing, at.origin(thing), 0.3)
     return way_out(at, thing, rest[rest[:, 2] > at.points(thing)[:, 2].max()], held)
 
 
 def in_the_way(at: Situation, thing: str, joint: int) -> Array | None:
-    """Return the displacement (3,) [m] of a thing to where a drawer does not come over it; None: it does not."""
+    """Return the displacement (3,) [m] of a thing out of a drawer's way; None: it is not in the way, or blocked."""
     moving = np.concatenate(at.moving(joint))
     opening = np.linspace(0, at.model.jnt_range[joint, 0] - at.data.qpos[at.model.jnt_qposadr[joint]], 5)
     rest = np.concatenate([moving + far * at.data.xaxis[joint] for far in opening])
@@ -62,7 +62,7 @@ def in_the_way(at: Situation, thing: str, joint: int) -> Array | None:
 
 
 def way_out(at: Situation, thing: str, over: Array, held: bool, margin: float = 2 * MARGIN) -> Array | None:
-    """Return the displacement (3,) [m] of a thing from under points (N, 3); None: it is not under them."""
+    """Return the displacement (3,) [m] of a thing from under points (N, 3); None: it is not under them, or blocked."""
     points, origin = at.points(thing), at.origin(thing)
     form = _Form(points, origin, 0.0)
     if not form.room(origin[None], over)[1][0]:
@@ -85,7 +85,7 @@ def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
         return Place(np.array([*middle[:2], (near if len(near) else support)[:, 2].max() + below + 0.004]))
     site = at.goal.sites[where]
     middle, axes = at.data.site_xpos[site], at.data.site_xmat[site].reshape(3, 3)
-    extent = np.abs(axes) @ at.model.site_size[site]  # of the region along the axes of the world
+    extent = np.abs(axes) @ at.model.site_size[site]  # half sizes of the region along the axes of the world
     floor = _floor(at, where, middle, extent)
     spots = np.column_stack([middle[:2] + GRID * extent[:2], np.full(len(GRID), floor + below + 0.01)])
     obstacles = at.others(thing, middle, float(extent[:2].max()) + 0.15)
@@ -125,7 +125,7 @@ def _hindrance(hands: Array, yaw: float, rest: Array) -> Array:
 
 
 def _floor(at: Situation, where: str, middle: Array, extent: Array) -> float:
-    """Return the height on which a thing in a region of half sizes (3,) about its middle (3,) stands [m]."""
+    """Return the height [m] of the floor of a region, which has half sizes `extent` (3,) about its middle (3,)."""
     owner = at.subject(where)
     lowest = float(middle[2] - extent[2])
     if not owner:
@@ -164,7 +164,7 @@ class _Form:
         return np.maximum(across[..., 0], across[..., 1])
 
     def room(self, spots: Array, rest: Array) -> tuple[Array, Array]:
-        """Return the free room (K,) [m] about the box at places (K, 3), and the share (K,) of a roof over it."""
+        """Return the free room (K,) [m] about the box at places (K, 3), and how much roof covers it, (K,) 0…1.25."""
         if not len(rest):
             return np.ones(len(spots)), np.zeros(len(spots))
         over = rest[:, 2] > spots[0, 2] + self._height
@@ -181,7 +181,7 @@ class _Form:
         margin: float = 2 * MARGIN,
         most: float = SLIT,
     ) -> Array | None:
-        """Return the shortest horizontal displacement (3,) [m] from a spot to where nothing is beside or over it.
+        """Return the cheapest horizontal displacement (3,) [m] from a spot to where nothing is over it, or None.
 
         Args:
             spot: (3,) of the thing's origin [m].
@@ -189,7 +189,7 @@ class _Form:
             costs: of the ways (W,), added to the distances [m].
             over: points (M, 3) to get away from by a margin; None: those of `rest` over the thing.
             margin: the margin [m].
-            most: by which it may push other things [m].
+            most: how far it may push other things [m].
         """
         over = _flat(rest[rest[:, 2] > spot[2] + self._height] if over is None else over)
         distances = np.arange(0.02, 0.3, 0.02)
@@ -205,6 +205,6 @@ class _Form:
 
 
 def _flat(points: Array) -> Array:
-    """Return one point in each little square of the horizontal plane of points (N, 3)."""
+    """Return the points (N, 3) thinned to one per cell of a horizontal grid."""
     squares = np.rint(points[:, :2] / SQUARE).astype(int) @ (1, 1 << 20)
     return points[np.unique(squares, return_index=True)[1]]

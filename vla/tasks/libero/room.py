@@ -7,7 +7,7 @@ import numpy as np
 from vla.spec import Array
 from vla.tasks.libero.situation import Situation
 
-PALM = 0.030  # highest that a thing may stand above the point between the fingertips [m]
+PALM = 0.030  # largest height of a thing above the point between the fingertips [m]
 TIP = 0.012  # of the fingers below that point [m]
 HAND = 0.10  # half of the width of the hand over the fingers [m]
 CLEAR = 0.045  # distance between a finger or the hand and anything else [m]
@@ -15,12 +15,12 @@ ARM = (0.34, 0.75)  # horizontal distances from the base between which the arm n
 
 
 def clearance(spots: Array, yaws: Array, others: Array, leans: Array | float = 0.0) -> Array:
-    """Return horizontal distances (K,) [m], 1 at most, of points (N, 3) from the hand and what is between its fingers.
+    """Return the horizontal distances (K,) [m], 1 at most, of the nearest point from hand and fingers, gap included.
 
     Args:
         spots: (K, 3) of the point between the fingertips [m].
         yaws: (K,) of the fingers [rad].
-        others: points (N, 3) of what is not to be touched [m].
+        others: points (N, 3) on what must not be touched [m].
         leans: (K,) of the hand about the axis along which the fingers close [rad].
     """
     others = others[others[:, 2] > spots[:, 2].min() - 0.02]

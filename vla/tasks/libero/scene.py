@@ -1,7 +1,7 @@
-"""Scenes of LIBERO as models that are light enough to keep many of: the same physics, smaller meshes and textures.
+"""LIBERO's scenes as models small enough to keep many of them: the same physics, smaller meshes and textures.
 
-Every different scene is compiled once and kept in the user's cache folder. Only what nothing collides with becomes
-smaller, and LIBERO takes masses from the other geoms alone, so physics stays what it is.
+Each distinct scene is compiled once and kept in the user's cache folder. Only meshes without collisions are simplified,
+and LIBERO's masses come from the other geoms alone, so the physics does not change.
 """
 
 from __future__ import annotations
@@ -28,34 +28,31 @@ from vla.tasks.rendering.shapes import mesh_texcoord, mesh_triangles
 VISIBLE = 1  # group of the geoms that are drawn; collisions are in group 0
 BURNER = "_burner"  # end of the name of a stove's glowing plate, a site
 WELD = 1e-6  # [m]
-METHOD = "without highlights on broad faces, more faces of fine things"  # part of the name of what is kept
+METHOD = "without highlights on broad faces, more faces of fine things"  # part of the cache key
 BROAD = 0.1  # area of a face above which MuJoCo, which lights vertices, shows no highlight within it [m²]
-FINE = 4  # a thing keeps one of so many faces where that is more than its detail, such as a basket's weave
-MOST = 3  # but so many times its detail at most
+FINE = 4  # a finely structured thing, such as a woven basket, keeps one of so many faces if that exceeds its detail
+MOST = 3  # but at most so many times its detail
 
 Faces = Annotated[int, Ge(100)]
 
 
 @dataclass(frozen=True)
 class Detail:
-    """How much of a scene's pictures is kept.
+    """Level of detail of a scene's pictures: the config node `task.detail`."""
 
-    Args of the config node `task.detail`.
-    """
-
-    things: Faces  # of a mesh of what tasks are about, but see FINE
-    robot: Faces  # of each of the robot's meshes
-    rest: Faces  # of each other mesh
+    things: Faces  # most faces of a mesh of a movable thing; up to MOST times as many for fine structures
+    robot: Faces  # most faces of a mesh of the robot
+    rest: Faces  # most faces of any other mesh
     texels: Annotated[int, Ge(16)]  # largest edge of a texture
 
 
 def load_scene(name: str, things: Collection[str], detail: Detail | None) -> mujoco.MjModel:
-    """Return the model of a scene; the first time it is compiled, which takes some seconds, and kept.
+    """Return the model of a scene, which is compiled in some seconds the first time, and then cached.
 
     Args:
         name: of the scene, as in `Task.scene`.
-        things: names of what tasks are about, whose meshes keep the most faces.
-        detail: of the pictures; None: of a model that only collides, a hundredth of the size.
+        things: names of the movable things, whose meshes keep the most faces.
+        detail: of the pictures; None: collision geometry only, a hundredth of the size.
 
     Raises:
         UserError: this MuJoCo cannot compile it.
@@ -76,7 +73,7 @@ def load_scene(name: str, things: Collection[str], detail: Detail | None) -> muj
 
 
 def save_model(model: mujoco.MjModel, path: Path) -> None:
-    """Write a model; an OSError if there is no room, of which MuJoCo's own writing only warns."""
+    """Write a model; an OSError if the disk is full, where MuJoCo's own function only warns."""
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
     path.write_bytes(content.data)

@@ -15,18 +15,18 @@ from vla.tasks.libero.scene import load_scene
 from vla.tasks.libero.starts import Start, set_start
 
 SPACING = 0.015  # between points on surfaces [m]
-CUBE = 0.012  # edge of the cubes in which one point stands for all, where a thing is in the way [m]
+CUBE = 0.012  # voxel size to which the points of obstacles are thinned [m]
 HELD = -0.3  # largest commanded opening at which the fingers press
 SHUT = -0.99  # largest commanded opening at which the fingers press as much as they can
 THIN = 0.003  # least distance of fingers that hold something [m]
 WRIST = 2.7  # largest turn of the last joint either way, whose limit is 2.9 [rad]
-SMALL = 0.2  # turn that is done wherever the last joint is [rad]
-SLANT = 0.3  # largest vertical component of the direction in which the fingers of such a hand close
-UPRIGHT = -0.6  # largest vertical component of where a hand that points down points
+SMALL = 0.2  # turn that is executed at any position of the last joint [rad]
+SLANT = 0.3  # largest vertical component of the direction in which the fingers of an upright hand close
+UPRIGHT = -0.6  # largest vertical component of the direction in which an upright hand points
 
 
 class Situation:
-    """A task at one state."""
+    """A task in one state."""
 
     def __init__(self, task: Task) -> None:
         """Args: the task."""
@@ -46,7 +46,7 @@ class Situation:
         ]
 
     def take(self, truth: dict[str, Array]) -> None:
-        """Take over a state from the simulator's truth."""
+        """Set the state from the simulator's truth."""
         bodies = [one["body"] for one in self.task.fixtures.values()]
         poses = {body: (pose[:3], pose[3:]) for body, pose in zip(bodies, truth["fixtures"], strict=True)}
         set_start(self.model, self.data, Start(truth["positions"], poses))
@@ -62,7 +62,7 @@ class Situation:
 
     @property
     def upright(self) -> bool:
-        """Whether the hand points down, if leaning, and its fingers close horizontally."""
+        """Whether the hand points down, possibly leaning, with fingers that close horizontally."""
         return bool(self.rotation[2, 2] < UPRIGHT and abs(self.rotation[2, 0]) < SLANT)
 
     def turn_to(self, yaw: float) -> float:
@@ -105,20 +105,20 @@ class Situation:
 
     @cached_property
     def rest(self) -> tuple[Array, Array]:
-        """Points (N, 3) on all things [m], and the bodies (N,) that they are of."""
+        """Points (N, 3) on all things [m], and the bodies (N,) that they belong to."""
         points = [self.points(thing)[self._sparse[thing]] for thing in self._shapes]
         owners = [np.full(len(some), body) for some, body in zip(points, self.goal.bodies.values(), strict=True)]
         return np.concatenate(points), np.concatenate(owners)
 
     def subject(self, name: str) -> str:
-        """Return the thing that a name is of: itself, or what a region belongs to."""
+        """Return the thing that a name refers to: the thing itself, or the owner of a region; "" if it has none."""
         if name in self.goal.bodies:
             return name
         owner = self.goal.owner[self.model.site_bodyid[self.goal.sites[name]]]
         return next((thing for thing, root in self.goal.bodies.items() if root == owner), "")
 
     def touched(self) -> str | None:
-        """Return the movable thing that both fingers touch, or one of them when they are closed and yet apart."""
+        """Return the movable thing that both fingers touch, or one of them if they are commanded shut and yet apart."""
         bodies = self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]
         touched = []
         for fingers in self._fingers:
@@ -137,7 +137,7 @@ class Situation:
         return bool(np.isin(others, list(self._movable - {root})).any())
 
     def _place(self, thing: str, body: int) -> list[Array]:
-        """Return points (N, 3) on each geom of a body [m]; those of bodies that did not move are kept."""
+        """Return points (N, 3) on each geom of a body [m], which are cached until the body moves."""
         pose = np.concatenate([self.data.xpos[body], self.data.xmat[body]])
         if body not in self._placed or not np.array_equal(self._placed[body][0], pose):
             turn = pose[3:].reshape(3, 3).T
@@ -145,7 +145,7 @@ class Situation:
         return self._placed[body][1]
 
     def _shape(self, root: int) -> dict[int, list[Array]]:
-        """Return body → points (N, 3) on each geom, in its frame, of a body and those that hang on it."""
+        """Return body → points (N, 3) on each of its geoms, in its frame, for all bodies of the thing at `root`."""
         shapes: dict[int, list[Array]] = {}
         model = self.model
         for geom in range(model.ngeom):
@@ -165,7 +165,7 @@ class Situation:
 
 
 def _sparse(shapes: Sequence[Sequence[Array]]) -> Array:
-    """Return rows of one point in each little cube of the points of bodies' geoms, one after the other."""
+    """Return the rows of one point per body and voxel among the concatenated points of all bodies' geoms."""
     bodies = [np.full(sum(map(len, geoms)), body) for body, geoms in enumerate(shapes)]
     points = np.concatenate([points for geoms in shapes for points in geoms])
     cubes = np.column_stack([np.concatenate(bodies), np.rint(points / CUBE)])

@@ -1,4 +1,4 @@
-"""What LIBERO's planner can do: commands (7,) for one step of a skill, from the present state alone."""
+"""Skills of LIBERO's planner: each returns the command (7,) for one step, from the present state alone."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from vla.tasks.libero.places import LOOSE, Place
 from vla.tasks.libero.room import HAND, TIP, axes
 from vla.tasks.libero.situation import THIN, Situation
 
-GAIN = 3.0  # of the distance to go, in a command: less leaves the hand a centimetre away from where it is to be
-TURN_GAIN = 1.0  # of the rotation to go: more is unstable where the arm folds up
+GAIN = 3.0  # on the remaining distance, in a command: with less, the hand stops a centimetre short of its target
+TURN_GAIN = 1.0  # on the remaining rotation: more is unstable where the arm folds up
 HOVER = 0.08  # height over a thing at which it is approached [m]
-NEAR, LEVEL, TURNED = 0.008, 0.008, 0.12  # tolerances of a grasp: across [m], in height [m], in yaw [rad]
+NEAR, LEVEL, TURNED = 0.008, 0.008, 0.12  # tolerances of a grasp: horizontal [m], in height [m], in yaw [rad]
 FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approaches come from above
-TURNED_ROOM = 0.05  # of a grasp, per angle by which it may be turned farther [m/rad]
-ROOM = 0.03  # largest distance across at which the hand comes down, if it touches nothing [m]
+TURNED_ROOM = 0.05  # room of a grasp per angle that is left of its tolerance [m/rad]
+ROOM = 0.03  # largest horizontal distance at which the hand comes down, if it touches nothing [m]
 MARGIN = 0.015  # height of open fingers over what they must not touch [m]
-FIRM = -0.9  # commanded opening at which they press as much as they can
+FIRM = -0.9  # commanded opening at which the fingers press as much as they can
 CARRY = 0.05  # height over all that is on the way [m]
-SWEEP = 0.08  # distance to the line along which a thing is carried within which it must be higher [m]
-SLOW = 0.012  # by which the hand is ahead of what it drags, or it slips [m]
+SWEEP = 0.08  # half width of the path of a carried thing, within which it passes over everything [m]
+SLOW = 0.012  # lead of the hand over what it drags; with more, it slips [m]
 BACK = 0.5  # lean of a hand that pushes [rad]
-EMPTY = 0.01  # largest distance of the fingers at which nothing worth keeping is between them [m]
+EMPTY = 0.01  # largest distance between fingers that hold nothing of use [m]
 STRAIGHT = 0.97  # least cosine of the tilt of a thing that is let go
 RESTS = 0.12  # height over its place at which a thing is let go if it lies on something there [m]
-TWIST = 0.4  # by which the hand is ahead of a knob that it turns on [rad]
+TWIST = 0.4  # lead of the hand over a knob that it turns [rad]
 UP = np.array([0.0, 0.0, 1.0])
 
 
 def approach(at: Situation, grasp: Grasp, points: Array, thing: str, opening: float = -1.0) -> Array:
     """Move to a grasp of points (N, 3) of a thing from above, along the hand, and close the fingers there.
 
-    The hand comes down where its fingers pass the thing, and corrects the rest meanwhile. The height changes gradually
-    with what room there is, so that no centimetre, which a policy can hardly see, decides between up and down.
+    The hand descends where its fingers clear the thing, and corrects the remaining error meanwhile. The height changes
+    gradually with the free room, so that no centimetre, which a policy can hardly see, decides between up and down.
     """
     grasp = alike(at, grasp)
     slope = np.array([*(-np.tan(grasp.lean) * axes(grasp.yaw)[1]), 1.0])  # of the line on which the hand comes
@@ -66,7 +66,7 @@ def approach(at: Situation, grasp: Grasp, points: Array, thing: str, opening: fl
 
 
 def lowest(at: Situation, top: float, room: float) -> float:
-    """Return the least height of the hand [m] over a place whose obstacles have a top, with that much room in them.
+    """Return the lowest height of the hand [m] among obstacles up to height `top`, with free room `room` [m].
 
     Where there is room the hand sinks, the faster the more there is; where there is none, it rises to the top.
     """
@@ -74,7 +74,7 @@ def lowest(at: Situation, top: float, room: float) -> float:
 
 
 def _funnel(distance: float) -> float:
-    """Return the height above what is to be passed at a distance from where the hand may be lower [m]."""
+    """Return the height [m] above obstacles at a horizontal distance [m] from where the hand may be lower."""
     return min(max(distance, 0.0) * FUNNEL, HOVER)
 
 
@@ -108,7 +108,7 @@ def carry(at: Situation, thing: str, place: Place) -> Array:
 
 
 def let_go(at: Situation, thing: str) -> Array:
-    """Let go of a held thing, but if it hangs askew only once what is below it has righted it."""
+    """Let go of a held thing; if it hangs askew, first lower it until what is below it has righted it."""
     points, frame = at.points(thing), at.data.xmat[at.goal.bodies[thing]].reshape(3, 3)
     axis = int(np.argmax(np.abs(frame[2])))
     up = frame[:, axis] * np.sign(frame[2, axis])  # of the thing
@@ -118,14 +118,14 @@ def let_go(at: Situation, thing: str) -> Array:
 
 
 def alike(at: Situation, grasp: Grasp) -> Grasp:
-    """Return the grasp with the same fingers in the same places that the hand reaches by the smallest turn."""
+    """Return the grasp, equal up to a swap of the fingers, that the hand reaches by the smallest turn."""
     turn = at.turn_to(grasp.yaw)
     same = np.cos(at.yaw + turn - grasp.yaw) > 0
     return Grasp(grasp.position, at.yaw + turn, grasp.lean if same else -grasp.lean)
 
 
 def _above(at: Situation, thing: str, spot: Array) -> float:
-    """Return by how much a thing must be higher than its spot to pass over all between it and the spot [m]."""
+    """Return how far above its spot a thing must be to pass over everything on the way there [m]."""
     origin = at.origin(thing)
     lowest = at.points(thing)[:, 2].min() - origin[2]
     way = spot[:2] - origin[:2]
@@ -223,26 +223,26 @@ def push(at: Situation, thing: str) -> Array:
 
 
 def closing(at: Situation, top: float) -> float:
-    """Return the gripper's command that closes it, but not on what is between the fingers, below a height [m]."""
+    """Return the gripper command: close, unless the open fingers could close on something below height `top` [m]."""
     return 1.0 if at.gap < EMPTY or at.hand[2] > top + TIP else -1.0
 
 
 def withdraw(at: Situation) -> Array:
-    """Move a hand that does not point down away from where it points, then let it point down."""
+    """Retract a hand that does not point down, opposite to where it points, then turn it down."""
     near = at.others("", at.hand, 0.1)
     if len(near) and np.linalg.norm(near - at.hand, axis=1).min() < 0.09:
         return move(at, at.hand - 0.05 * at.rotation[:, 2], at.rotation, -1.0)
-    inwards = at.base - at.hand  # not to a stretched arm
+    inwards = at.base - at.hand  # so that the arm is not stretched
     return command(at, at.hand + np.array([*(0.05 * inwards[:2] / np.hypot(*inwards[:2])), 0.02]), 0.0, -1.0)
 
 
 def tops(at: Situation) -> float:
-    """Return the height of what stands near the hand [m]."""
+    """Return the largest height of what stands near the hand [m]."""
     return float(at.others("", at.hand, HAND + 0.05)[:, 2].max(initial=-np.inf))
 
 
 def rising(at: Situation, target: Array) -> Array:
-    """Reduce the motion across while the hand has to rise, so that it hits nothing."""
+    """Reduce the horizontal motion while the hand has to rise, so that it hits nothing."""
     rise = target[2] - at.hand[2]
     if rise > 0.01:
         target = np.array([*(at.hand[:2] + (target[:2] - at.hand[:2]) * 0.02 / (0.02 + rise)), target[2]])

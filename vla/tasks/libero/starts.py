@@ -17,20 +17,17 @@ from vla.tasks.libero.package import Task, initial_states
 POSTURE_NOISE = 0.02  # standard deviation of the arm's joints at a start [rad], as robosuite's
 MARGIN = 0.005  # by which the official places exceed the ranges of their region [m]
 OVERLAP = 0.002  # largest depth of a contact between two things at a start [m]
-DRAWS = 200  # of places until no things overlap
+DRAWS = 200  # most redraws of a start while things overlap
 
 Motion = Callable[[Array], Array]  # of points (2,) of a table [m]
 
 
 @dataclass(frozen=True)
 class Randomize:
-    """What differs between drawn starts beyond what the regions of the benchmark allow.
+    """Variation of drawn starts in addition to the benchmark's regions: the config node `task.randomize`."""
 
-    Args of the config node `task.randomize`.
-    """
-
-    places: Share  # of the starts, in which two pairs of things, or one of three, exchange their places
-    colours: Share  # of the starts, in which about half of the things have another colour
+    places: Share  # share of starts in which two pairs of things swap places, or one pair if fewer than four things may
+    colours: Share  # share of starts in which about half of the things have another colour
 
 
 @dataclass(frozen=True)
@@ -58,12 +55,12 @@ class Starts:
             )
         self._model, self._task, self._states = model, task, states[:, 1 : 1 + model.nq]
         self._data = mujoco.MjData(model)
-        self._usual = self._overlapping(self.official(0))  # such as drawers in their cabinet
+        self._usual = self._overlapping(self.official(0))  # pairs that always overlap, such as a drawer and its cabinet
         self._owners = {part[1]: part[2] for part in task.initial if part[0] in ("on", "in")}
         self._exchangeable = [thing for thing in self._owners if self._may_move(thing)]
 
     def official(self, number: int) -> Start:
-        """Return an official start, with the fixtures as the scene was made; they are not in its state."""
+        """Return an official start, with the fixtures as in the task, because its state does not contain them."""
         poses = {
             one["body"]: (np.array(one["position"]), np.array(one["quaternion"]))
             for one in self._task.fixtures.values()
@@ -71,11 +68,11 @@ class Starts:
         return Start(self._states[number].copy(), poses)
 
     def drawn(self, random: np.random.Generator, exchanged: bool) -> Start:
-        """Draw a start: fixtures, things, openings and the arm's posture, until nothing overlaps.
+        """Draw a start: fixtures, things, openings and the arm's posture, up to `DRAWS` times more if things overlap.
 
-        Things on a table are drawn in the ranges of their regions, others, and openings, within what the official
-        states span; heights and tilts are those of the official states, which are alike in them. `exchanged`: two pairs
-        of things on tables, or one of three, exchange their regions first where sentence and goal stay true.
+        Things on a table are drawn from the ranges of their regions, other things and openings from the range of the
+        official states; heights and tilts are those of the official states, which share them. With `exchanged`, two
+        pairs of things on tables, or one pair, swap their regions first, where sentence and goal remain true.
         """
         start = self._draw(random, exchanged)
         for _ in range(DRAWS):
@@ -85,10 +82,10 @@ class Starts:
         return start
 
     def _may_move(self, thing: str) -> bool:
-        """Whether a thing stands on a table, and neither its place nor one beside it is part of the task."""
+        """Return whether a thing stands on a table, and neither its place nor one beside it is part of the task."""
         kind, goal = thing.rpartition("_")[0], set(self._task.goal)
         twins = [name for name in self._owners if name != thing and name.rpartition("_")[0] == kind]
-        for twin in twins:  # of a different role, so that the sentence tells them apart by their places
+        for twin in twins:  # if their roles differ, the sentence tells them apart by their places
             exchange = {thing: twin, twin: thing}
             if {tuple(exchange.get(name, name) for name in part) for part in goal} != goal:
                 return False
@@ -123,7 +120,7 @@ class Starts:
         return start
 
     def _region(self, name: str, random: np.random.Generator) -> Array | None:
-        """Draw x and y in a region of a table, in the world [m]; None: it is none."""
+        """Draw a point (2,) in a region of a table, in the world [m]; None if there is no such region."""
         region = self._task.regions.get(name)
         if region is None or not region["ranges"]:
             return None
@@ -135,7 +132,7 @@ class Starts:
         return body.pos[:2] + site.pos[:2] + half * random.uniform(-1, 1, len(middle))
 
     def _move_fixture(self, name: str, region: str | None, start: Start, random: np.random.Generator) -> Motion:
-        """Draw a fixture's place and yaw into `start`, and return how it differs from the official one."""
+        """Draw a fixture's place and yaw into `start`, and return its motion from the official pose."""
         place = None if region is None else self._region(region, random)
         if place is None:
             return lambda point: point
@@ -160,7 +157,7 @@ class Starts:
         return place if with_fixture is None else with_fixture(place)
 
     def _turn(self, row: int, random: np.random.Generator) -> Array:
-        """Draw the quaternion of a thing: as the official ones, which differ in yaw only, if at all."""
+        """Draw the quaternion of a thing like the official ones, which differ only in yaw, if at all."""
         quaternions = self._states[:, row + 3 : row + 7]
         first, relative = quaternions[0], np.empty(4)
         conjugate = first * np.array([1, -1, -1, -1])
@@ -174,7 +171,7 @@ class Starts:
         return turned
 
     def _overlapping(self, start: Start) -> set[tuple[int, int]]:
-        """Return the pairs of bodies that are deep in each other."""
+        """Return the pairs of bodies that penetrate each other by more than `OVERLAP`."""
         set_start(self._model, self._data, start)
         contact = self._data.contact
         deep = contact.geom[: self._data.ncon][contact.dist[: self._data.ncon] < -OVERLAP]

@@ -21,7 +21,7 @@ CONTROL_HZ = 80.0  # five substeps of 2.5 ms
 REACH = 0.01  # largest displacement of the hand per step, along each axis [m]
 STATE = ("hand_x", "hand_y", "hand_z", "opening")  # the first four numbers of an observation
 MOST_STEPS = 500  # of an episode, after which Meta-World refuses to go on
-# Of the simulator's observation (39,).
+# Components of the simulator's observation (39,).
 OBJECT, GOAL = slice(4, 7), slice(36, 39)
 
 
@@ -35,10 +35,10 @@ Window = Annotated[tuple[Share, Share, Share, Share], Predicate(within)]
 
 
 class MetaWorld(ManyTasks):
-    """Fifty tasks of a Sawyer arm, one of them per episode: the seed determines which, in turn.
+    """Fifty tasks of a Sawyer arm, one of them per episode: seeds cycle through them.
 
-    Success is the first step that Meta-World calls one; an episode ends with it, or when its steps are used up. The
-    state is the hand's position and the opening of the gripper, 0…1; the truth is where object and goal are.
+    An episode ends at the first step that Meta-World counts as a success, or when its steps are used up. The state is
+    the hand's position and the opening of the gripper, 0…1; the truth includes the positions of object and goal.
     """
 
     def __init__(
@@ -62,12 +62,12 @@ class MetaWorld(ManyTasks):
             sentences: task → instruction.
             tiers: difficulty → tasks, for reports.
             renderer: renderer of the images.
-            image_size: height and width of every camera's images [px]; the same, unless all they show is a `window`.
+            image_size: height and width of every camera's images [px]; equal, unless all images show the `window`.
             cameras: names of cameras, such as "corner2", which is moved and turned as LeRobot does, or "hand", the part
                 of "corner2" around a point 75 mm below the hand, in whole pixels of LeRobot's picture.
             window: top, left, bottom and right of LeRobot's picture that "corner2" shows, as shares of its height and
                 width; None: all of it.
-            hand_size: height and width of what "hand" shows, as shares of LeRobot's picture.
+            hand_size: height and width of the part that "hand" shows, as shares of LeRobot's picture.
             drawn: height and width in which a camera's full picture is rendered before it is cropped to its window and
                 averaged down to `image_size` [px]. None: the window is rendered directly in `image_size`.
             shadows: edge of the shadow map [texels]; 0: no shadows.
@@ -77,7 +77,7 @@ class MetaWorld(ManyTasks):
             UserError: a task is unknown or has no sentence, or pictures would be stretched.
         """
         super().__init__()
-        known = self._known = tasks_of("mt50")  # the truth names a task by its place here
+        known = self._known = tasks_of("mt50")  # the truth gives a task by its index here
         self.tasks = tuple(tasks_of(tasks) if isinstance(tasks, str) else tasks)
         listed = {*self.tasks, *sentences, *(name for names in tiers.values() for name in names)}
         if unknown := sorted(listed - {*known}):

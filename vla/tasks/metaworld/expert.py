@@ -14,7 +14,7 @@ from vla.tasks.metaworld.package import VERSION, tasks_of
 
 
 class Scripted:
-    """Meta-World's expert of the task at hand, a function of the simulator's observation, clipped to the bounds."""
+    """Meta-World's expert for the current task: a function of the simulator's observation, clipped to the bounds."""
 
     looks = False
     memoryless = True  # of all fifty experts of Meta-World 3.0.0
@@ -28,7 +28,7 @@ class Scripted:
         self._expert: Any = None
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Start an episode: the expert of its task is made anew, should it remember anything."""
+        """Start an episode, with a new expert for its task, in case experts have a state."""
         self._expert = None
 
     def act(self, observation: Observation) -> Array:

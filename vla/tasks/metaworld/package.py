@@ -1,4 +1,4 @@
-"""The package `metaworld`, made to work with a current MuJoCo, and its names of tasks.
+"""The package `metaworld`, made to work with a current MuJoCo, and the names of its tasks.
 
 Task names are those of the package without their version: "push-back" is `push-back-v3`.
 """
@@ -13,8 +13,8 @@ from metaworld import env_dict
 from metaworld.sawyer_xyz_env import SawyerMocapBase
 
 VERSION = "-v3"
-# Where a weld holds a body: anchor (3), relative position (3) and quaternion (4), torque scale. A current MuJoCo has a
-# twelfth number, which upstream's row of eleven does not fit.
+# Data of a weld: anchor (3), relative position (3) and quaternion (4), torque scale. In a current MuJoCo the row has a
+# twelfth number, so that upstream's row of eleven does not fit.
 WELD = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 5.0)
 
 
@@ -30,7 +30,7 @@ warnings.filterwarnings("ignore", r"Constant\(s\) may be too high", module=r"met
 def tasks_of(benchmark: str) -> tuple[str, ...]:
     """Return the names of the tasks of a benchmark, "mt1", "mt10", "mt25" or "mt50", in the package's order.
 
-    MT1 is any single task; by this name it is the one of Meta-World's own example.
+    MT1 is any single task; here it is the one in Meta-World's own example.
     """
     if benchmark == "mt1":
         return ("reach",)
@@ -38,14 +38,14 @@ def tasks_of(benchmark: str) -> tuple[str, ...]:
 
 
 def simulator(task: str) -> Any:
-    """Make the simulator of a task, whose resets draw object and goal from the generator that `seed` sets."""
+    """Make the simulator of a task; its resets draw object and goal with the random generator that `seed` seeds."""
     made = env_dict.ALL_V3_ENVIRONMENTS[task + VERSION]()
-    # What `set_task` of the benchmark MT1 does, but for freezing one place of object and goal.
+    # Like `set_task` of the benchmark MT1, but without freezing the positions of object and goal.
     made._partially_observable = False  # the goal is part of the observation, which only the expert sees
     made.__dict__.pop("sawyer_observation_space", None)  # cached, and depends on it
     made._set_task_called = True
     made._freeze_rand_vec, made.seeded_rand_vec = False, True
-    # Published figures are of MuJoCo 3.3.0, where several contacts of a pair of meshes were off by default.
+    # Published results are from MuJoCo 3.3.0, where multiple contacts per pair of meshes were off by default.
     made.model.opt.disableflags |= getattr(mujoco.mjtDisableBit, "mjDSBL_MULTICCD", 0)
     return made
 
@@ -53,8 +53,8 @@ def simulator(task: str) -> Any:
 def stop_sliding(simulator: Any) -> None:
     """Stop the thermos of the tasks with a stick, after a reset.
 
-    Upstream means to, but clears entries of the positions' place in the velocities. With MuJoCo 3.3.0 it stands still
-    all the same; a current one leaves it sliding to its goal at 0.58 m/s, where no stick is needed to push it.
+    Upstream means to, but clears the velocities at the indices of its position. With MuJoCo 3.3.0 the thermos stands
+    still all the same; with a current one it slides to its goal at 0.58 m/s, so that no stick is needed to push it.
     """
     model, data = simulator.model, simulator.data
     for name in ("obj_slidex", "obj_slidey"):

@@ -26,7 +26,7 @@ CURRENT, BEFORE = slice(18), slice(18, 36)  # of an observation (39,): hand, gri
 
 
 class TaskScene:
-    """Simulator of a task with the cameras as LeRobot has them; its renderer is made with the first picture."""
+    """Simulator of a task with LeRobot's camera poses; its renderer is made with the first picture."""
 
     def __init__(self, task: str, spec: Spec, renderer: RendererFactory, drawn: int | None, shadows: int) -> None:
         """Compile a task; a UserError if it lacks a camera. For `drawn` and `shadows` see `MetaWorld`."""
@@ -43,23 +43,23 @@ class TaskScene:
         model.cam_pos[camera] = CAMERA_PLACE
         model.cam_quat[camera] = _turned()
         model.vis.quality.shadowsize = shadows
-        model.mat_reflectance[:] = 0  # of the renderers none draws it, and in no task does it show from corner2
+        model.mat_reflectance[:] = 0  # no renderer draws reflections, and none is visible from corner2
         shown = {part.camera: part for part in spec.parts}
         self._parts = [shown.get(name, Part(name)) for name in cameras]
         self._places = [known.index(CAMERA if name == HAND else name) for name in cameras]
-        # All of a camera's picture is drawn once.
+        # A full picture is drawn once per camera, even if several windows are cut from it.
         seen = self._places if drawn is None else sorted(set(self._places))
         height, width = self._size if drawn is None else (drawn, drawn)
         self._views = Views(seen, height, width, site_groups=(0, 1, 2), aspect=1.0)
         self._renderer = LazyRenderer(renderer, self.model, self._views)
 
     def reset(self, seed: int) -> Array:
-        """Draw object and goal; return the observation (39,): hand, gripper, objects, the same a step before, goal."""
+        """Draw object and goal; return the observation (39,): hand, gripper, objects, these one step before, goal."""
         self.simulator.seed(seed)
         observation, _ = self.simulator.reset()
         stop_sliding(self.simulator)
-        # Some tasks move bodies after the last step of physics: without this the first observation and picture still
-        # have objects and goals where the episode before, or the model's file, has them.
+        # Some tasks move bodies after the last step of physics: without this, the first observation and picture would
+        # still show objects and goals where they were in the previous episode, or are in the model's file.
         mujoco.mj_kinematics(self.model, self.simulator.data)
         current = self.simulator._get_curr_obs_combined_no_goal()
         observation[CURRENT] = observation[BEFORE] = self.simulator._prev_obs = current
@@ -93,7 +93,7 @@ class TaskScene:
 def parts_of(cameras: Sequence[str], window: Sequence[float] | None, hand_size: float) -> Iterator[Part]:
     """Yield what cameras show of LeRobot's picture: CAMERA a window or all of it, HAND the part around the hand.
 
-    Where CAMERA alone shows all of it, there are no parts.
+    If only CAMERA shows it, and all of it, there are no parts.
     """
     if CAMERA in cameras and (window is not None or HAND in cameras):
         yield Part(CAMERA, tuple(window or WHOLE))
@@ -103,7 +103,7 @@ def parts_of(cameras: Sequence[str], window: Sequence[float] | None, hand_size: 
 
 
 def _turned() -> Array:
-    """Return the orientation (4,) of CAMERA as LeRobot turns its pictures, wxyz."""
+    """Return the orientation (4,) of CAMERA with LeRobot's half turn of its pictures, wxyz."""
     turned = np.empty(4)
     mujoco.mju_mulQuat(turned, np.array(ORIENTATION), HALF_TURN)
     return turned

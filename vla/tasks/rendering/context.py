@@ -1,6 +1,6 @@
 """The GL context of this process, which all fast renderers share.
 
-Drivers compile shaders and texture filters anew in every context: most of the time that opening a renderer takes.
+Drivers compile shaders and texture filters anew in every context, which takes most of the time of opening a renderer.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ class Context:
 
     @contextmanager
     def used_by(self, renderer: object) -> Iterator[bool]:
-        """Make the context current; tell whether another renderer may have changed its bindings meanwhile."""
+        """Make the context current; yield whether another renderer may have changed its bindings since the last use."""
         with self._lock, self.gl:
             changed, self._user = self._user != id(renderer), id(renderer)
             yield changed
 
     def depth_renderbuffer(self, size: tuple[int, int]) -> Any:
-        """Make a depth buffer (width, height) of floats in the current context, which takes no conversion to read.
+        """Make a float32 depth buffer (width, height) in the current context, which is read without conversion.
 
-        Those of moderngl are of integers, so its storage is replaced.
+        moderngl makes integer buffers only, so the storage is replaced.
         """
         buffer, integer = self.gl.depth_renderbuffer(size), ctypes.c_uint
         _function("glBindRenderbuffer", integer, integer)(RENDERBUFFER, buffer.glo)
@@ -58,7 +58,7 @@ class Context:
         integer = ctypes.c_uint
         target.use()
         _function("glBindFramebuffer", integer, integer)(READ_FRAMEBUFFER, source.glo)
-        _function("glReadBuffer", integer)(COLOR_ATTACHMENT0)  # reading depth chose none
+        _function("glReadBuffer", integer)(COLOR_ATTACHMENT0)  # reading depth deselected it
         blit = _function("glBlitFramebuffer", *[ctypes.c_int] * 8, integer, integer)
         blit(0, 0, *source.size, 0, 0, *target.size, COLOR_BUFFER_BIT, LINEAR)
 

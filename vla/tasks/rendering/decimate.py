@@ -14,12 +14,12 @@ import numpy as np
 from vla.io.files import atomic_path
 from vla.spec import Array
 
-METHOD = "fast-simplification 0.2"  # part of the content's name: another method gives other faces
+METHOD = "fast-simplification 0.2"  # part of the cache key: another method gives other faces
 Mesh = tuple[Array, Array, Array]  # vertices (V, 3) float32, faces (F, 3) int32, texture coordinates (F, 3 corners, 2)
 
 
 def decimate(vertices: Array, faces: Array, texcoord: Array | None, most: int) -> Mesh:
-    """Return a mesh of at most about `most` faces near a mesh's surface, with its texture in the same places.
+    """Simplify a mesh to at most about `most` faces, with its texture in the same places.
 
     Args:
         vertices: (V, 3).
@@ -34,7 +34,7 @@ def decimate(vertices: Array, faces: Array, texcoord: Array | None, most: int) -
     with suppress(OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error), np.load(path) as kept:
         return kept["vertices"], kept["faces"], kept["texcoord"]
     result = _simplified(vertices, faces, texcoord, most)
-    # Atomically, as other processes may read it; without room for it, do without.
+    # Written atomically, as other processes may read it; without disk space, the mesh is not cached.
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as draft:
@@ -55,7 +55,7 @@ def _simplified(vertices: Array, faces: Array, texcoord: Array | None, most: int
     if texcoord is None:
         return fewer, triangles, np.zeros((*triangles.shape, 2), np.float32)
     moved, _, target = replay_simplification(vertices, faces, collapses)
-    triangles = target[faces]  # every face that remains is one of the mesh, whose corners were moved
+    triangles = target[faces]  # every remaining face is an original one with its corners moved
     one, two, three = triangles.T
     kept = (one != two) & (two != three) & (three != one)
     distance = np.linalg.norm(vertices - moved[target], axis=1)
@@ -66,14 +66,14 @@ def _simplified(vertices: Array, faces: Array, texcoord: Array | None, most: int
 def _transferred(faces: Array, texcoord: Array, target: Array, distance: Array) -> Array:
     """Return the texture coordinates (F, 3, 2) of the corners of faces after their vertices were merged.
 
-    A corner gets the mean over the vertices that were merged into one, weighted by 1 / distance². Where a seam of the
-    texture runs through these, only those on the corner's side of it count: what edges within them lead to.
+    A corner gets the mean over the vertices that were merged into one, weighted by 1 / distance². Where a texture seam
+    runs through these, only those on the corner's side of it count: those connected to it by edges among them.
 
     Args:
         faces: (F, 3) indices of vertices.
         texcoord: (F, 3, 2) before.
         target: (V,) vertex that each vertex was merged into.
-        distance: (V,) from there.
+        distance: (V,) of each vertex from where it was moved.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

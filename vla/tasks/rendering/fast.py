@@ -1,8 +1,8 @@
-"""A renderer that draws the scene once: few draw calls on one framebuffer for all cameras.
+"""A renderer with few draw calls, on one framebuffer for all cameras.
 
 All geometry is in one buffer, and each vertex names its element. Poses and appearance are textures with a row per
 element. A frame uploads the poses, draws one shadow map per lamp for all cameras, then each camera's picture with few
-calls per texture, and reads all of them back at once. The sky is drawn where their depth shows a gap.
+calls per texture, and reads all of them back at once. The sky is drawn only for cameras whose depth has gaps.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from vla.tasks.rendering.textures import Textures
 
 log = logging.getLogger(__name__)
 BEHIND = 0.3  # factor on the alpha of a plane seen from behind, as in MuJoCo
-GAP = 120  # largest number of invisible indices to draw between two calls, which is faster than a second call
+GAP = 120  # largest number of invisible indices drawn to join two calls, which is faster than a second call
 MARGIN = 1.01  # factor on the radius of elements, against rounding
 PACKAGES = "libegl1, libgl1 and libgl1-mesa-dri"
 
@@ -61,7 +61,7 @@ class Fast:
         return f"the fast renderer needs EGL, which this machine lacks (packages {PACKAGES})", "mujoco"
 
     def open(self, model: mujoco.MjModel, views: Views) -> Renderer:
-        """Make a renderer of `model`; a UserError without EGL: a store names its renderer, so none replaces it."""
+        """Make a renderer of `model`; a UserError without EGL: no other replaces it, as stores name their renderer."""
         return FastRenderer(_context(), model, views, self)
 
 
@@ -91,7 +91,7 @@ class FastRenderer:
     """Pictures of one model by OpenGL 3.3."""
 
     def __init__(self, context: Context, model: mujoco.MjModel, views: Views, settings: Fast, coarser: int = 0) -> None:
-        """Args: the context; model; views; settings; levels by which textures are coarser than samples need."""
+        """Take context, model, views, settings, and the mipmap levels by which textures are coarser than needed."""
         self._context, self._gl, self._settings, self._coarser = context, context.gl, settings, coarser
         self._model, self._views = model, views
         self._cameras = ModelCameras(model, views)
@@ -128,7 +128,7 @@ class FastRenderer:
         self._averaged = gl.framebuffer(gl.renderbuffer((width, height), 4)) if self._fine == 2 else self._drawn
 
     def _make_tables(self) -> None:
-        """Make the textures of poses and appearance: changing a row of one is how an element moves."""
+        """Make the textures of poses and appearance; an element is moved or changed by writing its row."""
         count = self._model.ngeom + self._model.nsite + 1  # the last one is the sky
         self._poses = np.zeros((count, shaders.POSE, 4), np.float32)
         self._poses[-1] = np.eye(3, 4)
@@ -139,7 +139,7 @@ class FastRenderer:
             texture.filter = moderngl.NEAREST, moderngl.NEAREST
 
     def _make_programs(self) -> None:
-        """Compile the shaders, a program per kind of texture, and give each texture that all read a unit."""
+        """Compile the shaders, one program per kind of texture, and assign units to the textures that all read."""
         gl, settings, lights = self._gl, self._settings, uniforms.drawn_lights(self._model).tolist()
         spot = self._model.light_type == uniforms.SPOT
         pixel = bool(spot[lights].any())  # light at vertices, as in MuJoCo, would miss the edge of a spot
@@ -153,7 +153,7 @@ class FastRenderer:
         units |= {f"shadow{number}": depth for number, depth in enumerate(self._shadows.maps)}
         self._units = list(units.values())
         self._bind()
-        self._skin = len(units)  # the unit of the texture of what is being drawn
+        self._skin = len(units)  # unit of the texture of the element being drawn
         for unit, name in enumerate((*units, "skin")):
             for program in (*self._programs.values(), self._shadows.program):
                 if name in program:
@@ -165,7 +165,7 @@ class FastRenderer:
             texture.use(unit)
 
     def _make_buffers(self) -> None:
-        """Make the buffer of all geometry, and its reading by each program, which skips what that does not use."""
+        """Make the buffer of all geometry, and a vertex array per program, without the attributes it does not use."""
         self._seen = Buffers(self._gl)
         names = "in_position", "in_normal", "in_coordinate", "in_element"
         self._scene = {}
@@ -176,7 +176,7 @@ class FastRenderer:
             self._scene[kind] = self._gl.vertex_array(program, content, self._seen.indices)
 
     def update(self, textures: Collection[int] = ()) -> None:
-        """Upload what has changed in the model; `textures` are the ids of those whose pixels have."""
+        """Upload what has changed in the model; `textures` are the ids of textures with changed pixels."""
         with self._context.used_by(self) as changed:
             if changed:
                 self._bind()
@@ -195,7 +195,7 @@ class FastRenderer:
                 self._table_texture.write(table)
 
     def _place_elements(self) -> None:
-        """Upload the elements' triangles, and note where they are."""
+        """Upload the elements' triangles, and store their places in the buffer."""
         placed, sky = self._geometry.elements, len(self._elements.kind)
         self._seen.update([each.seen for each in placed])
         ends = np.cumsum([0, *(each.seen.triangles.size for each in placed)]).tolist()
@@ -209,7 +209,7 @@ class FastRenderer:
         radius = {each.element: each.radius for each in placed}
         radius |= dict.fromkeys(self._planes, np.inf)  # they may move along with a camera
         self._radii = MARGIN * np.array([radius[element] for element in self._opaque])
-        # Elements enter and leave a picture seldom, so the merged calls are kept for every set that was in sight.
+        # Elements rarely enter or leave a picture, so the merged calls are cached for every set of visible elements.
         self._merged: dict[bytes, list[DrawCall]] = {}  # whether each opaque element is in sight → what to draw
         self._shadows.update([each for each in placed if each.element != sky])
 
@@ -282,7 +282,7 @@ class FastRenderer:
     def _draw_skies(self) -> Array:
         """Draw the sky for the cameras that see it; return the depth buffer as `_read_depth` does.
 
-        Depth has to be read anyway, and a reading is cheaper than a sky behind a picture that things fill.
+        Depth has to be read anyway, and reading it is cheaper than drawing a sky that is completely hidden.
         """
         depth = self._read_depth()
         numbers = [number for number, seen in enumerate(depth) if self._sky >= 0 and seen.max() >= 1]
@@ -354,7 +354,7 @@ class FastRenderer:
         return depth
 
     def close(self) -> None:
-        """Free all that the renderer has in the GL context."""
+        """Free the renderer's GL objects."""
         context = self._context
         vars(self).clear()
         context.clean()

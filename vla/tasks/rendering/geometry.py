@@ -1,4 +1,4 @@
-"""Drawn elements of a model, geoms and sites, and all their geometry in one buffer of vertices and one of indices."""
+"""Drawn elements of a model, geoms and sites, and all their geometry in one vertex buffer and one index buffer."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def elements_of(model: mujoco.MjModel, views: Views) -> Elements:
 
 
 def unsupported(model: mujoco.MjModel, views: Views) -> list[str]:
-    """Name what MuJoCo's renderer would draw of a model and the fast one does not."""
+    """Name the features of a model that MuJoCo's renderer draws and the fast one does not."""
     elements = elements_of(model, views)
     infinite = (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE) & (elements.size[:, :2] <= 0).any(axis=1)
     sky = (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any()
@@ -99,7 +99,7 @@ class Part:
     triangles: Array  # (T, 3) int32, from 0
 
     def fits(self, other: Part) -> bool:
-        """Return whether another part differs in nothing but what its vertices contain."""
+        """Return whether another part has as many vertices and the same triangles."""
         same = len(self.vertices) == len(other.vertices)
         return self is other or (same and np.array_equal(self.triangles, other.triangles))
 
@@ -136,14 +136,14 @@ class ElementTriangles:
     seen: Part  # with vertices of position, normal, texture coordinates or direction, element: 10 floats
     casting: Part  # with vertices of position and element, 4 floats, shared by all triangles at the same place
     closed: bool  # whether the triangles enclose a volume
-    radius: float  # of a sphere around the element's origin with everything in it [m]
+    radius: float  # of the smallest sphere around the element's origin that contains it [m]
 
 
 class Geometry:
-    """Vertices of the elements drawn: opaque ones by texture, planes after the others, the sky, transparent ones."""
+    """Triangles of the drawn elements: opaque ones sorted by texture, planes last, then the sky, transparent ones."""
 
     def __init__(self, model: mujoco.MjModel, mesh: Callable[[int, bool], Surface]) -> None:
-        """Take the model, and a function from a mesh's id, and whether it has a texture, to its triangles."""
+        """Take the model, and a function from a mesh's id and whether it is textured to its triangles."""
         self._model, self._mesh = model, mesh
         self._far = clip_range(model)[1]
         quality = model.vis.quality
@@ -155,10 +155,10 @@ class Geometry:
         self.elements: list[ElementTriangles] = []
 
     def update(self, elements: Elements, sky: bool) -> None:
-        """Make the triangles of the elements' present shapes; equal ones stay the same objects."""
+        """Make the triangles of the elements' current shapes; unchanged ones remain the same objects."""
         opaque = np.flatnonzero(elements.opaque)
         planes = elements.kind == Kind.mjGEOM_PLANE
-        # Large things are mostly behind small ones, and what is hidden when it is drawn costs little.
+        # Small elements first: large ones are mostly behind them, and drawing hidden surfaces costs little.
         order = opaque[np.lexsort((opaque, self._reach[opaque], elements.texture[opaque], planes[opaque]))]
         blended = [self._of(elements, int(each)) for each in np.flatnonzero(elements.seen & ~elements.opaque)]
         solid = [self._of(elements, int(element)) for element in order]

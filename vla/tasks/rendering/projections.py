@@ -9,7 +9,7 @@ from vla.spec import Array
 from vla.tasks.rendering.renderer import Views
 
 UPSIDE_DOWN = np.diag([1.0, -1.0, 1.0, 1.0])  # the first row of the framebuffer becomes the top of the picture
-DIRECTIONAL = 1  # mjtLightType, a name that MuJoCo 3.3.0 lacks, with which `reference` works
+DIRECTIONAL = 1  # of mjtLightType, which is missing in MuJoCo 3.3.0, where `reference` must work, too
 WIDEST = 160.0  # field of view of a spot light's shadow map [degrees]
 
 
@@ -68,13 +68,13 @@ def shadow_projection(model: mujoco.MjModel, data: mujoco.MjData, light: int) ->
 
 
 class ModelCameras:
-    """The cameras of a model that are drawn, in the present state."""
+    """The cameras of a model that pictures are drawn for, in the current state."""
 
     def __init__(self, model: mujoco.MjModel, views: Views) -> None:
         self._model, self._views, self.ids = model, views, np.array(views.cameras)
 
     def update(self) -> None:
-        """Take over the model's present lenses."""
+        """Read the projections of the cameras from the model."""
         self._whole = np.stack([self._lens(camera) for camera in self.ids])
         self._show(None)
 
@@ -87,7 +87,7 @@ class ModelCameras:
         self._sides = sides / np.linalg.norm(sides[:, :, :3], axis=2, keepdims=True)  # of the frustums, looking inwards
 
     def place(self, data: mujoco.MjData, windows: Array | None) -> Array:
-        """Move the cameras to where they are in a state; return projections of the world (cameras, 4, 4)."""
+        """Read the poses of the cameras from a state; return the projections (cameras, 4, 4) of the world."""
         if windows is not None or self._windows is not None:
             self._show(windows)
         self.eyes, self.axes = data.cam_xpos[self.ids], data.cam_xmat[self.ids].reshape(-1, 3, 3)

@@ -72,9 +72,9 @@ class ReferenceRenderer:
         mujoco.mjr_render(self._rect, self._scene, self._context)
 
     def _show(self, eye: mujoco.MjvGLCamera, top: float, left: float, bottom: float, right: float) -> None:
-        """Narrow what an eye of the scene's camera sees to a window of it."""
+        """Narrow the frustum of one eye of the scene's camera to a window."""
         above, height = eye.frustum_top, eye.frustum_top - eye.frustum_bottom
-        # MuJoCo calls it a width, and draws twice as much; without it the aspect of the pictures decides.
+        # Half of the width, despite MuJoCo's name for it; if it is 0, the aspect ratio of the pictures determines it.
         half = eye.frustum_width or (self._views.aspect or self._views.width / self._views.height) * height / 2
         eye.frustum_center += half * (left + right - 1)
         eye.frustum_width = half * (right - left)

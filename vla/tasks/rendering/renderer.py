@@ -28,7 +28,7 @@ class Renderer(Protocol):
     """Off-screen renderer of one model; it may be bound to the thread that made it."""
 
     def update(self, textures: Collection[int] = ()) -> None:
-        """Take over changes of the model since the last call: call it after every change, such as at resets.
+        """Apply all changes of the model since the last call: call it after every change, such as at resets.
 
         Args:
             textures: ids of textures whose pixels have changed; all other changes are found by comparison.
@@ -45,12 +45,12 @@ class Renderer(Protocol):
 
         Returns:
             Colours (cameras, height, width, 3) uint8, and depth along the optical axis (cameras, height, width)
-            float32 [m], 0 where nothing is; a sky is something, up to 0.7 to 1 of the farthest distance away.
+            float32 [m], 0 where nothing is; a sky counts, at 0.7 to 1 times the distance of the far clipping plane.
         """
         ...
 
     def close(self) -> None:
-        """Free what the renderer has in GL."""
+        """Free the renderer's GL objects."""
         ...
 
 
@@ -68,10 +68,10 @@ class LazyRenderer:
     def __init__(
         self, factory: RendererFactory, model: mujoco.MjModel, views: Views, textures: set[int] | None = None
     ) -> None:
-        """Args: what makes it; the model; what to draw; ids of textures with new pixels, which a picture empties."""
+        """Take the factory, the model, the views, and the ids of textures with new pixels, which `render` clears."""
         self._open, self._textures = partial(factory.open, model, views), set() if textures is None else textures
         self._renderer: Renderer | None = None
-        self.changed = False  # whether the model has, since the last picture
+        self.changed = False  # whether the model has changed since the last picture
 
     def render(self, data: mujoco.MjData, windows: Array | None = None) -> tuple[Array, Array]:
         """Draw every camera's picture, as `Renderer.render`."""
@@ -84,7 +84,7 @@ class LazyRenderer:
         return self._renderer.render(data, windows)
 
     def close(self) -> None:
-        """Free GL."""
+        """Close the renderer, if there is one."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 POSE = 3  # texels of an element's pose: rows of a 3 x 4 matrix
-TEXELS = 4  # of an element's appearance: colour, light, what it follows, rate of texture coordinates there
+TEXELS = 4  # of an element's appearance: colour, light, axes that follow the eye, texture coordinates per metre
 ROWS = 6  # of a light: ambient, diffuse, specular, position, direction, attenuation
 CAMERA = 20  # floats of a camera's block before shadow projections and lights: projection and eye
 Skin = Literal["none", "2d", "cube"]
@@ -80,7 +80,7 @@ def scene_program(
         skin: kind of texture.
         pixel: whether to compute light per pixel instead of per vertex.
         soft: texels around the nearest one over which shadows are averaged.
-        coarser: levels that are added to those of textures.
+        coarser: bias on the mipmap level of textures.
     """
     count, spots = len(lamps), list(lamps.values())
     shared = f"""#version 330
@@ -165,8 +165,8 @@ void main() {{
 
 
 def _shown(kind: str, soft: int) -> str:
-    """Return the function that looks up which share of a place's surroundings a lamp shines on; a spot light's place is
-    a vec4, and is divided by its last component."""
+    """Return the GLSL function that looks up the share of a place's surroundings that is lit by a lamp; for a spot
+    light, the place is a vec4 and is divided by its last component."""
     look, scale, end = ("texture", "1.0", "") if kind == "vec3" else ("textureProj", "at.w", ", 0.0")
     taps = [(x, y) for x in range(-soft, soft + 1) for y in range(-soft, soft + 1)]
     sums = [f"{look}(map, at + {kind}({x}.0 * texel.x, {y}.0 * texel.y, 0.0{end}))" for x, y in taps]

@@ -14,8 +14,8 @@ from vla.spec import Array
 from vla.tasks.rendering import shaders
 from vla.tasks.rendering.geometry import Buffers, ElementTriangles
 
-SLOPE, UNITS = 1.5, 4.0  # offset of shadow maps against surfaces that shade themselves, as in MuJoCo
-RIM = 2  # texels of a shadow map, both sides together, that stay empty: shadows at its edge would never end
+SLOPE, UNITS = 1.5, 4.0  # polygon offset of shadow maps, against self-shadowing, as in MuJoCo
+RIM = 2  # empty border of a shadow map, both sides together [texels]: shadows at its edge would never end
 STATE = moderngl.DEPTH_TEST | moderngl.CULL_FACE
 Span = tuple[int, int]  # first index of triangles, and number of indices
 
@@ -23,11 +23,12 @@ Span = tuple[int, int]  # first index of triangles, and number of indices
 class Shadows:
     """Shadow maps of the lamps of a model.
 
-    What stands still is drawn again only when it or a lamp was moved. Every frame copies its map and adds the rest.
+    Static elements are drawn again only if one of them or a lamp has moved. Every frame copies their map and adds the
+    moving elements.
 
     Attributes:
         maps: depth texture of each lamp.
-        program: of the shaders.
+        program: the shader program.
     """
 
     def __init__(self, gl: Any, model: mujoco.MjModel, lamps: Sequence[int], soft: int) -> None:
@@ -42,11 +43,11 @@ class Shadows:
         self._casters = gl.vertex_array(self.program, content, self._buffers.indices)
         fixed = (model.body_weldid == 0) & (model.body_mocapid < 0)
         self._fixed = np.flatnonzero(np.append(fixed[model.geom_bodyid], fixed[model.site_bodyid]))  # elements
-        self._state: bytes | None = None  # of what stands still, in which its maps were drawn
+        self._state: bytes | None = None  # poses of the static elements in their maps
         self._written = -1  # number of the lamp whose uniforms the program has
 
     def _target(self) -> Any:
-        """Make the framebuffer of a map, with a colour that nobody writes: without one moderngl copies nothing."""
+        """Make the framebuffer of a map, with an unused colour attachment: without one moderngl copies nothing."""
         gl, size = self._gl, (self._edge, self._edge)
         depth = gl.depth_texture(size)
         depth.compare_func = "<="
@@ -67,7 +68,7 @@ class Shadows:
         self._state = None
 
     def aim(self, lamps: Array, projections: Sequence[Array]) -> None:
-        """Take over positions of the lamps (lamps, 3) [m], and projections (4, 4) of the world into their maps."""
+        """Set the positions (lamps, 3) [m] of the lamps, and the projections (4, 4) of the world into their maps."""
         self._uniforms = [
             {"projection": projection.T.astype(np.float32).tobytes(), "lamp": lamp.astype(np.float32).tobytes()}
             for projection, lamp in zip(projections, lamps, strict=True)
@@ -95,7 +96,7 @@ class Shadows:
         gl.polygon_offset = 0.0, 0.0
 
     def _draw(self, target: Any, closed: Span, still_open: Span) -> None:
-        """Draw triangles that enclose a volume, whose front faces are nearer to a lamp outside, and the others."""
+        """Draw the front faces of closed surfaces, the nearest to a lamp outside, and both sides of open ones."""
         target.use()
         target.viewport = RIM // 2, RIM // 2, self._edge - RIM, self._edge - RIM
         for state, (first, count) in ((STATE, closed), (moderngl.DEPTH_TEST, still_open)):

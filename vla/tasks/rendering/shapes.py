@@ -12,7 +12,7 @@ from vla.spec import Array
 
 SMOOTH = 0.8  # smallest cosine between a mesh's normal at a vertex and that of a face that is shaded smoothly
 VERTEX = ("position", "normal", "texcoord", "raw")  # what a `Surface` has of every vertex
-WELD = 1e-6  # largest distance between vertices at the same place, over the shape's size
+WELD = 1e-6  # largest distance between vertices at the same place, relative to the shape's size
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Surface:
     texcoord: Array  # (V, 2), 0…1 over the shape
     raw: Array  # (V, 3) position before scaling, the direction in a cube texture
     triangles: Array  # (T, 3) int32, indices of vertices, counterclockwise from outside
-    source: Surface | None = None  # of which this one was stretched
+    source: Surface | None = None  # the shape that this one is a stretched copy of
 
     def scaled(self, size: Array) -> Surface:
         """Return the shape stretched by `size` (3,)."""
@@ -55,9 +55,9 @@ class Surface:
 
 
 def _closed(position: Array, triangles: Array) -> bool:
-    """Return whether triangles (T, 3) between positions (W, 3) enclose a volume, and look away from it.
+    """Return whether triangles (T, 3) of positions (W, 3) enclose a volume, and face away from it.
 
-    Every edge must be as often in one direction as in the other.
+    Every edge must occur equally often in both directions.
     """
     if not len(triangles):
         return False
@@ -69,7 +69,7 @@ def _closed(position: Array, triangles: Array) -> bool:
 
 
 def join(*shapes: Surface) -> Surface:
-    """Return one shape of several."""
+    """Join several shapes into one."""
     starts = np.cumsum([0, *(len(shape.position) for shape in shapes)])
     position, normal, texcoord, raw = (np.concatenate([getattr(each, name) for each in shapes]) for name in VERTEX)
     triangles = np.concatenate([each.triangles + start for each, start in zip(shapes, starts, strict=False)])
@@ -107,7 +107,7 @@ def tube(slices: int) -> Surface:
 
 
 def disk(slices: int, side: int) -> Surface:
-    """Return a disk of radius 1 at z = side, -1 or 1, that looks away from the origin."""
+    """Return a disk of radius 1 at z = side, -1 or 1, that faces away from the origin."""
     azimuth = 2 * np.pi * np.arange(slices) / slices
     rim = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(slices, float(side))], 1)
     position = np.concatenate([[[0.0, 0.0, side]], rim])
@@ -147,7 +147,7 @@ def box() -> Surface:
 
 
 def plane(half_x: float, half_y: float) -> Surface:
-    """Return a rectangle in z = 0 that looks along z [m]."""
+    """Return a rectangle in the plane z = 0 that faces along z; lengths in [m]."""
     across = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
     position = np.concatenate([across * [half_x, half_y], np.zeros((4, 1))], 1)
     normal = np.tile([0.0, 0.0, 1.0], (4, 1))
@@ -171,7 +171,7 @@ def mesh_texcoord(model: mujoco.MjModel, mesh: int) -> Array | None:
 
 
 def mesh(model: mujoco.MjModel, number: int) -> Surface:
-    """Return the triangles of a model's mesh, with its own normals where they are near those of the faces."""
+    """Return a model's mesh with its normals; without texture coordinates, sharp edges get the faces' normals."""
     vertices, faces = mesh_triangles(model, number)
     start, stop = model.mesh_faceadr[number], model.mesh_faceadr[number] + model.mesh_facenum[number]
     corners = vertices[faces]  # (F, 3 corners, 3)
@@ -183,8 +183,8 @@ def mesh(model: mujoco.MjModel, number: int) -> Surface:
 
 
 def smoothed(vertices: Array, faces: Array, texcoord: Array) -> Surface:
-    """Return triangles (V, 3) and (F, 3) with texture coordinates (F, 3 corners, 2) and with normals that are averaged
-    where faces meet at a flat angle."""
+    """Return the surface of vertices (V, 3) and faces (F, 3) with texture coordinates (F, 3 corners, 2), with normals
+    that are averaged over adjacent faces except at sharp edges."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     smooth = np.zeros_like(vertices)
@@ -195,7 +195,7 @@ def smoothed(vertices: Array, faces: Array, texcoord: Array) -> Surface:
 
 
 def _sharpened(corners: Array, normals: Array) -> Array:
-    """Return normals (F, 3, 3) with the face's own one where the given one is far from it."""
+    """Return normals (F, 3, 3), replaced by the face's own one where they deviate much from it."""
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-20)
     near = np.einsum("fci,fi->fc", normals, across) >= SMOOTH
@@ -203,7 +203,7 @@ def _sharpened(corners: Array, normals: Array) -> Array:
 
 
 def _shared(corners: Array, normals: Array, texcoord: Array) -> Surface:
-    """Return a shape whose triangles share equal vertices, of arrays (F, 3 corners, …)."""
+    """Return the surface of arrays (F, 3 corners, …), with equal vertices shared by its triangles."""
     rows = np.concatenate([corners, normals, texcoord], axis=2).reshape(-1, 8).astype(np.float32)
     rows = np.ascontiguousarray(rows + 0.0)  # no negative zeros
     whole = rows.view(np.dtype((np.void, rows.itemsize * 8)))

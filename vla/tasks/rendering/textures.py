@@ -1,4 +1,4 @@
-"""The textures of a model on the graphics processor."""
+"""The textures of a model in OpenGL."""
 
 from __future__ import annotations
 

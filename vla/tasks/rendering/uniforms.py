@@ -1,4 +1,4 @@
-"""What the shaders of pictures read for a camera: projections, and lights as in MuJoCo's fixed-function lighting."""
+"""The uniforms of a camera: its projections, and lights as in MuJoCo's fixed-function lighting."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def drawn_lights(model: mujoco.MjModel) -> Array:
 
 
 def light_rows(model: mujoco.MjModel) -> Array:
-    """Return (1 + lights, ROWS, 4) float32: the headlight, then the drawn lights, not yet in place."""
+    """Return (1 + lights, ROWS, 4) float32: the headlight, then the drawn lights, still without poses."""
     lights = drawn_lights(model)
     table = np.zeros((1 + len(lights), ROWS, 4), np.float32)
     head, active = model.vis.headlight, model.light_active[lights, None].astype(bool)
@@ -55,7 +55,7 @@ class CameraUniforms:
         self._places = b""
 
     def update(self, data: mujoco.MjData, windows: Array | None, shadows: Shadows) -> None:
-        """Upload the blocks for a state; where a light has moved, aim the shadow maps anew."""
+        """Upload the blocks for a state; if a light has moved, aim the shadow maps again."""
         places = data.light_xpos.tobytes() + data.light_xdir.tobytes()
         if self.stale or places != self._places:
             self.stale, self._places = False, places

@@ -35,7 +35,7 @@ class Disturbance:
 
     kind: Kind
     times: int  # how often
-    delay: int  # number of control steps whose preconditions hold before the disturbance happens
+    delay: int  # number of control steps for which its preconditions hold before it happens
     distance: float  # of a push or a move [m]
     angle: float  # of its horizontal direction; if there is no room, the next free direction is taken [rad]
     low: tuple[float, float]  # corner x, y of the area in which a push or a move ends [m]
@@ -80,7 +80,7 @@ class CompiledScene:
         self.stale_textures: set[int] = set()  # ids of textures that a renderer has not uploaded yet
 
     def restore(self) -> None:
-        """Begin anew without randomisation: nominal model, three blocks in a row, arm at home."""
+        """Undo all randomisation: nominal model, three blocks in a row, arm at home."""
         mujoco.mj_resetData(self.model, self.data)
         for name, value in self._nominal.items():
             getattr(self.model, name)[:] = value
@@ -152,7 +152,7 @@ class CompiledScene:
         self.data.qpos[here + 2] = self.extents[: self.present, 2]
 
     def forward_without_servos(self) -> None:
-        """Compute what follows from the state, with servos that do nothing yet."""
+        """Compute all quantities that depend on the state, without forces of the servos."""
         option, off = self.model.opt, int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
         option.disableflags |= off
         mujoco.mj_forward(self.model, self.data)

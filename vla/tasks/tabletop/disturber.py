@@ -27,11 +27,11 @@ from vla.tasks.tabletop.scene import PAD_RADIUS
 
 PUSH_STEP = 0.04  # largest motion of a push per control step [m]
 OPEN_STEPS = 3  # control steps for which a drop keeps the gripper open
-APPROACH = 0.2  # distance between tool and block at which it is being approached [m]
+APPROACH = 0.2  # distance between tool and block below which the block is being approached [m]
 ABOVE = 0.02  # height of the gripper above an object at which it can be moved [m]
-BESIDE = 0.09  # horizontal distance from the gripper at which it can be moved, too [m]
+BESIDE = 0.09  # horizontal distance from the gripper at which the object can be moved, too [m]
 GAP = 0.02  # between a moved object and its neighbours [m]
-DIRECTIONS = 24  # tried until one is free
+DIRECTIONS = 24  # largest number of directions to try
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # between a direction and the next one to try [rad]
 
 Target = tuple[Literal["pad", "block"], int]  # kind and index of the object at the destination of a subgoal
@@ -63,12 +63,12 @@ class Disturber:
         return np.append(action[:6], 1.0) if self.opens else action
 
     def update(self, step: int, state: WorldState, now: Subgoal) -> bool:
-        """Continue a push or a drop, or let a disturbance happen that is due; return whether an object was moved.
+        """Continue a push or a drop, or start a disturbance that is due; return whether an object was moved.
 
         Args:
             step: index of the control step that comes next.
             state: state before it.
-            now: subgoal that is pursued.
+            now: current subgoal.
         """
         self._steps_left = max(0, self._steps_left - 1)
         if self._steps_left:

@@ -43,7 +43,7 @@ class Tabletop(World):
 
     An episode of a chain below `FIRST_SEED` is one of its instructions, drawn from the seed: the scripted expert
     carries out those before it, unseen, and the episode begins where it stopped. A demonstration thus has one
-    instruction, and starts where a policy is when it is given a new one.
+    instruction, and starts where a policy would be when it is given that instruction.
     """
 
     viewpoint: tuple[Point, Point] = ((1.2, -0.7, 0.75), (0.38, 0.0, 0.2))
@@ -118,13 +118,13 @@ class Tabletop(World):
         return self.look()
 
     def _skip_to(self, number: int) -> None:
-        """Let the scripted expert carry out the instructions before one, which then is the only one of the episode.
+        """Let the scripted expert carry out the instructions before the one of index `number`, then the only one.
 
-        If it fails at one of them, the episode is about that one.
+        If the expert fails at one of them, the episode has that one instead.
         """
         task, expert = self.simulation, Waypoint(self.spec)
         self._joint_noise, self._image_noise = np.random.RandomState(0), np.random.default_rng(0)
-        task.disturber = None  # disturbances are for who acts next
+        task.disturber = None  # disturbances are for the agent of the episode
         with self.blind():
             while task.current < number and not task.over:
                 task.step(expert.act(self.look()))
@@ -203,7 +203,7 @@ class Tabletop(World):
         return {model.body(body).name: pose[body] for body in range(model.nbody)}
 
     def minimal_step(self) -> dict[str, Callable[[], object]]:
-        """Return name → minimal work of a control step from the present state, as calls for the benchmark to time."""
+        """Return name → minimal work of a control step from the current state, as functions for benchmarks to time."""
         compiled = self.simulation.compiled
         copy = mujoco.MjData(compiled.model)
 
@@ -214,7 +214,7 @@ class Tabletop(World):
         return {"physics": step, "rendering": lambda: self.renderer.render(compiled.data)}
 
     def close(self) -> None:
-        """Free GL."""
+        """Close the renderer."""
         self.renderer.close()
 
     def look(self) -> Observation:
@@ -234,7 +234,7 @@ class Tabletop(World):
     def _grainy(self, pictures: Array) -> Array:
         """Add normal noise to pictures (cameras, H, W, 3), in whole grey levels up to 127.
 
-        A random byte chooses one of 256 equally probable values, which takes an eighth of the time of normal numbers.
+        A random byte selects one of 256 equally probable values, in an eighth of the time of drawing normal numbers.
         """
         levels = np.rint(self.simulation.compiled.noise.image * QUANTILES).clip(-127, 127).astype(np.int8)
         grain = self._image_noise.bytes(pictures.size).translate(levels.tobytes())

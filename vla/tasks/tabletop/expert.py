@@ -22,8 +22,8 @@ FUNNEL = 2.5  # height gained per metre of horizontal distance, so that approach
 GRASP_XY, GRASP_Z = 0.012, 0.012  # position tolerances at which the gripper closes [m]
 PLACE_Z = 0.012  # height tolerance at which the gripper opens [m]
 ABOVE = 0.004  # least height of a fingertip above the table [m]
-# A push continues far beside its line, only slower. Near its destination the direction of a push is so sensitive that a
-# policy which is off by half a centimetre would otherwise see, in turns, a block to push and one to get behind again.
+# Far beside its line a push still continues, only slower. Near the destination its direction is so sensitive that a
+# policy which is off by half a centimetre would otherwise alternate between pushing and getting behind the block again.
 LANE = 0.024  # lateral tolerance of the fingertips in a push [m]
 SLOWER = 0.8  # share of the speed of a push that is lost at this tolerance
 BEHIND = 0.010  # horizontal distance from the start of a push within which the fingertips descend [m]
@@ -103,8 +103,8 @@ class Waypoint:
     def _push(self, truth: dict[str, Array]) -> Array:
         """Move behind the block, opposite its destination, and push it with closed fingers.
 
-        Wide fingers close to a wedge, which presses a block down or lifts it. They push with their narrow, upright
-        side, leave the block sideways before they rise, and are not led astray while they touch it.
+        Wide fingers close to a wedge, which would press a block down or lift it. They push with their narrow, upright
+        side and leave the block sideways before they rise, and no excursion begins while they touch it.
         """
         block, (half, _, half_height) = truth["block"], truth["half_size"]
         fingertip, breadth, below, middle = truth["tip"]
@@ -138,7 +138,7 @@ class Waypoint:
         return self._action(truth, _rising_first(offset) + self._swing(beside, yaw), yaw, 0.0)
 
     def _swing(self, beside: Array, yaw: float) -> Array:
-        """Return the motion (3,) of the tool which keeps the point at `beside` it in place in a step that turns it."""
+        """Return the motion (3,) of the tool that keeps the point `beside` it in place while the tool turns."""
         return beside - rotation_z(float(np.clip(yaw, self._low[5], self._high[5]))) @ beside
 
     def _action(self, truth: dict[str, Array], offset: Array, yaw: float, gripper: float) -> Array:

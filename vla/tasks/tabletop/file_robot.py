@@ -27,13 +27,13 @@ FREQUENCY = 100.0  # natural frequency of a joint of the arm with its servo, at 
 LEAD = 0.05  # damping over stiffness of the servos [s], as of the Panda's, so that joints are overdamped
 ARMATURE = 0.1  # smallest reflected rotor inertia of a joint of the arm [kg m²], as of the Panda's
 SOFTNESS = 0.1  # share of a finger's travel after which its servo gives its whole force
-FASTEST = 0.02  # time in which its whole force moves a finger through its travel, at least [s]
+FASTEST = 0.02  # shortest time in which its whole force moves a finger through its travel [s]
 CLOSING = 0.2  # shortest time in which the gripper closes [s]
 OPENINGS, SETTLING = 17, 250  # commands at which the opening is measured; steps in which the fingers come to rest
 LEAST_TRAVEL = 0.02  # change of the opening of a gripper that can hold a block [m]
 LEAST_OPENING = 2 * BLOCK_HALF_SIZE + CLEARANCE  # [m]
 ASIDE = 0.08  # largest distance between the tool point and the middle between the closed fingertips [m]
-AROUND_BLOCK = 0.06  # opening with room for a block, in whose middle the tool point belongs [m]
+AROUND_BLOCK = 0.06  # opening with room for a block, in the middle of which the tool point belongs [m]
 BESIDE = 0.005  # how far beside this middle it may be [m]
 BELOW = 0.012  # how far fingertips may reach below the tool point, so that they do not touch the table [m]
 
@@ -73,7 +73,7 @@ class FileRobot(TabletopRobot):
             robot_spec.use_convex_hulls(spec)
 
     def complete(self, scene: mujoco.MjSpec) -> None:
-        """Add the robot to an exported scene: written as MJCF, for PyMJCF, its numbers would have six digits."""
+        """Add the robot to an exported scene: as MJCF text, for PyMJCF, its numbers would have only six digits."""
         turn = (np.cos(self._file.yaw / 2), 0.0, 0.0, np.sin(self._file.yaw / 2))
         place = scene.worldbody.add_frame(pos=self._file.place, quat=turn)
         scene.attach(self._spec.copy(), frame=place, prefix=PREFIX)

@@ -1,7 +1,7 @@
 """The parts of a gripper that hold a block: named shapes, or the far ends of jaws on a hinge.
 
-A jaw that turns on a hinge stays close to the other jaw there, and its mesh collides as a convex hull, which fills the
-space between the jaws. Such shapes are cut: their last centimetres are the fingertips.
+Near its hinge a jaw always stays close to the other one, and its mesh collides as a convex hull, which fills the
+space between the jaws. Such shapes are cut, and their last centimetres are the fingertips.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from vla.tasks.tabletop.robot import FINGERTIP_CONTACT, HIDDEN, ROBOT_CONTACT
 from vla.tasks.tabletop.robot_file import compiled, require
 from vla.tasks.tabletop.robot_spec import TOOL, add_hull
 
-FAR_END = 0.03  # length of a jaw's part that holds a block [m]
-FAR = 1.0  # up to which a gap is measured [m]
+FAR_END = 0.03  # length of the part of a jaw that holds a block [m]
+FAR = 1.0  # largest gap that is measured [m]
 
 
 def named(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
-    """Return the names of the geoms `names` and of those of the bodies `names`; a site becomes a geom of its shape."""
+    """Return the names of colliding geoms in `names` and in the bodies `names`; a site becomes a geom of its shape."""
     geoms, bodies, sites = ({each.name: each for each in kind} for kind in (spec.geoms, spec.bodies, spec.sites))
     require("fingertips", names, (*geoms, *bodies, *sites), "geom, body or site")
     tips: list[Any] = []
@@ -51,7 +51,7 @@ def _add(body: Any, name: str, kind: mujoco.mjtGeom, **shape: Any) -> Any:
 
 
 def soften(spec: mujoco.MjSpec, tips: Sequence[str]) -> None:
-    """Give shapes the contact of fingertips."""
+    """Give shapes the contact parameters of fingertips."""
     for tip in map(spec.geom, tips):
         tip.friction, tip.condim, tip.priority, tip.solref = (
             FINGERTIP_CONTACT[each] for each in ("friction", "condim", "priority", "solref")
@@ -128,8 +128,8 @@ def _beyond(triangles: Array, heights: Array) -> Array:
 
 
 def _divide(spec: mujoco.MjSpec, tip: str, end: Array, rest: Array) -> str:
-    """Let the hulls of two parts of a geom, points (N, 3) in the frame of its body, collide in its place; return the
-    name of the hull of `end`, or of the geom if that is flat."""
+    """Replace the collisions of a geom by those of the hulls of its two parts, points (N, 3) in the frame of its body;
+    return the name of the hull of `end`, or of the unchanged geom if that hull is flat."""
     if not add_hull(spec, f"{tip}_end", end):
         return tip
     whole = spec.geom(tip)

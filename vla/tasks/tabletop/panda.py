@@ -87,7 +87,7 @@ class Panda(TabletopRobot):
         scene.attach(mjcf.from_xml_string(_mjcf(self._meshes)))
 
     def grip(self, opening: float) -> tuple[float, float]:
-        """Return half the opening, at most their travel, for both fingers and their common servo."""
+        """Return half the opening, limited to the travel of a finger, for both fingers and their common servo."""
         half = min(opening / 2, panda.FINGER_TRAVEL)
         return half, half
 
@@ -147,7 +147,7 @@ def _assets(meshes: str) -> str:
     folder, text = Path(package.origin).parent / MESHES, ""
     for name in (*(f"link{index}" for index in range(8)), "hand", "finger"):
         file = folder / "collision" / f"{name}.stl"
-        # Convex hulls of the collision meshes; with shadows, every face is rendered twice per camera.
+        # Convex hulls of the collision meshes: every face costs time, with shadows more than once.
         light = attributes(vertex=spread(read_corners(file))) if meshes == "light" else ""
         text += f'<mesh name="{name}" file="{file}"/>'
         text += f'<mesh name="{name}_seen" {light or attributes(file=str(folder / "visual" / f"{name}.stl"))}/>'
@@ -161,7 +161,7 @@ def _geoms(mesh: str, rgba: tuple[float, ...], collides: bool = True) -> str:
 
 
 def _finger(side: str, turn: float) -> str:
-    """Return a finger, of which nothing but the soft fingertip collides."""
+    """Return a finger; only its soft fingertip collides."""
     tip = attributes(rgba=DARK, group=VISIBLE, **FINGERTIP_CONTACT, **ROBOT_CONTACT)
     return f"""<body name="{side}_finger" gravcomp="1" {attributes(pos=(0, 0, FINGER_OFFSET), euler=(0, 0, turn))}>
           <inertial mass="{FINGER_MASS}" pos="0 0 0" diaginertia="2.375e-6 2.375e-6 7.5e-7"/>

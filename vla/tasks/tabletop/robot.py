@@ -24,7 +24,7 @@ FINGERTIP_CONTACT = {
 }
 # Options of MuJoCo; elliptic cones and `impratio` prevent slip of held blocks.
 PHYSICS = {"timestep": 0.004, "integrator": "implicitfast", "cone": "elliptic", "impratio": 10}
-VISIBLE, HIDDEN = 2, 3  # groups of geoms: in pictures, for collisions only
+VISIBLE, HIDDEN = 2, 3  # groups of geoms: drawn, and for collisions only
 CORNERS = 64  # vertices of every "light" mesh
 
 
@@ -42,8 +42,8 @@ def _text(value: ArrayLike) -> str:
 
 
 def camera(position: Sequence[float], target: Sequence[float], fovy: float, up: Sequence[float]) -> str:
-    """Return the attributes in MJCF of a camera at `position` that looks at `target` [m], with a vertical field of view
-    [degrees]; `up` is a direction to the upper edge of its pictures."""
+    """Return the MJCF attributes of a camera at `position` that looks at `target` [m], with a vertical field of view
+    `fovy` [degrees]; `up` is the direction towards the upper edge of its pictures."""
     return attributes(pos=position, xyaxes=look_at(position, target, up)[:, :2].T, fovy=fovy)
 
 

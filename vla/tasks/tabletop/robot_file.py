@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 Values = Annotated[dict[str, float], MinLen(1)]
 HAND = "hand_"  # in front of the names in a hand's own file
-# What a model says of the world around it: that of the tabletop holds, and MuJoCo warns of every difference.
+# Settings of a model for the world around it: the tabletop's apply, and MuJoCo warns of every difference.
 OF_THE_WORLD = ("option", "authored", "visual", "stat", "memory", "nstack", "nconmax", "njmax", "nuserdata")
 LISTED = 30  # names in an error
 
@@ -39,20 +39,20 @@ class RobotFile:
 
     Attributes:
         file: arm, in MJCF or URDF.
-        hand: file of its hand, the names in which get `hand_` in front; None: `file` contains the hand.
+        hand: file of its hand, whose names get the prefix `hand_`; None: `file` contains the hand.
         mount: site or body of the arm that carries this hand.
         place: position of the base; the table's top is at height 0 [m].
         yaw: of the base [rad].
-        joints: J hinges of the arm, base to tip; other joints below the hand are fixed.
+        joints: J hinges of the arm, base to tip; other joints outside of the hand are fixed.
         home: (J,) positions in which the gripper points down over the table and closes sideways [rad].
         speed: largest speed of the joints [rad/s].
         tool: site or body of the hand whose axes are the tool's: x is the one that points forward at home, z down.
-        offset: of the tool point, between the fingertips, in this frame [m]. It is moved aside to the middle of a block
-            between them, which is not that of one jaw that moves, and down if they reach far below it.
+        offset: of the tool point, between the fingertips, in this frame [m]. It is moved sideways to the middle of the
+            jaws when a block is between them, and down if the fingertips reach far below it.
         open: actuator or joint of the gripper → its value when open; joints get position servos.
         closed: the same when closed.
         force: largest force of these servos [N], or torque [N m].
-        fingertips: names of the geoms, bodies or sites that hold a block: of either side.
+        fingertips: names of the geoms, bodies or sites that hold a block, for each side.
         camera: position of the wrist camera in the tool's frame [m].
         target: point that it looks at [m].
     """
@@ -129,15 +129,15 @@ def read(file: Path, key: str) -> mujoco.MjSpec:
     plain = mujoco.MjSpec()
     for name in (*OF_THE_WORLD, *(name for name in dir(plain) if name.startswith("nuser_"))):
         setattr(spec, name, getattr(plain, name))
-    # URDF: keep shapes that do not collide, and links that do not move, which the tool may be one of.
+    # URDF: keep shapes that do not collide, and links that do not move, of which the tool may be one.
     spec.compiler.discardvisual = spec.compiler.fusestatic = False
     compiled(spec, named)
     return spec
 
 
 def _located(named: str, mesh: str, folder: Path, model: Path) -> Path:
-    """Return the file of a mesh that is named by a path in a folder, or by an address as in ROS (UserError: an address
-    of another kind, or of a package that is not found)."""
+    """Return the file of a mesh, given by a path in a folder or by a URI as in ROS (UserError: a URI of another scheme,
+    or of a package that is not found)."""
     if "://" not in mesh:
         return folder / mesh
     try:
@@ -165,7 +165,7 @@ def _folders(variable: str) -> list[Path]:
 
 
 def _drop_textures(spec: mujoco.MjSpec, named: str, path: Path) -> None:
-    """Take textures, which are not drawn and so need not exist, out of a model."""
+    """Remove the textures of a model, which are not drawn, so that their files need not exist."""
     text = path.read_bytes()
     in_urdf = b"<robot" in text and b"<texture" in text  # MuJoCo itself ignores these
     if in_urdf or any(texture.file or any(texture.cubefiles) for texture in spec.textures):
@@ -191,7 +191,7 @@ def compiled(spec: mujoco.MjSpec, named: str = "task.robot") -> mujoco.MjModel:
 
 
 def require(key: str, names: Iterable[str], known: Iterable[str], kind: str) -> None:
-    """Raise a UserError that lists the `kind` of elements that there are if one of `names` is not among them."""
+    """Raise a UserError, which lists the known elements of this `kind`, if one of `names` is not among them."""
     there = [name for name in known if name]
     for name in names:
         if name not in there:

@@ -1,4 +1,4 @@
-"""Models of robots, made alike for the tabletop."""
+"""Adaptation of robot models to the tabletop."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ def descendants(model: mujoco.MjModel, body: int) -> set[int]:
 
 
 def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str]) -> None:
-    """Keep of a model what the tabletop needs: the arm's `joints`, the hand, and the actuators `grips` of the gripper.
+    """Reduce a model to what the tabletop needs: the arm's `joints`, the hand, and the gripper's actuators `grips`.
 
-    Joints below the hand that are not the arm's are fixed, and what couples them goes with them. Lamps, cameras,
-    planes, pairs of contacts, sensors, key frames, and materials but for their colour are left out.
+    Joints of neither the arm nor the hand are fixed, and their couplings removed, like lamps, cameras, planes, contact
+    pairs, sensors, key frames, and materials except for their colours.
     """
     model = compiled(spec)
     hand = descendants(model, int(model.joint(list(joints)[-1]).bodyid[0]))
@@ -86,7 +86,7 @@ def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str
 
 
 def _drop_couplings(spec: mujoco.MjSpec, model: mujoco.MjModel, fixed: Collection[str]) -> set[str]:
-    """Delete tendons and constraints of `fixed` joints or within what moves as one; return the names of the tendons."""
+    """Delete tendons and constraints of `fixed` joints, or within bodies that move as one; return the tendon names."""
     moved = {int(model.jnt_bodyid[joint.id]) for joint in spec.joints if joint.name not in fixed}
     part = np.arange(model.nbody)  # the first of the bodies that move as one with a body
     for body in range(1, model.nbody):
@@ -114,7 +114,7 @@ def _drop_couplings(spec: mujoco.MjSpec, model: mujoco.MjModel, fixed: Collectio
 
 
 def _simplify_geoms(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Let every shape collide with the world only, and draw the shapes that do not collide where a body has any."""
+    """Let every colliding geom collide with the world only; draw the visual geoms of a body, or else the others."""
     solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     drawn = (model.geom_group < SEEN_GROUPS) & (model.geom_rgba[:, 3] > 0)
     shells = set(model.geom_bodyid[drawn & ~solid].tolist())
@@ -140,14 +140,14 @@ def set_armature(spec: mujoco.MjSpec, joints: Iterable[str], least: float) -> No
 
 
 def add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, force: float | None) -> str:
-    """Add a position servo to a joint; return its name. Nothing is left to the defaults of the file."""
+    """Add a position servo to a joint; return its name. It does not depend on the defaults of the file."""
     servo = spec.add_actuator(name=SERVO + joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     servo.dyntype, servo.gear = mujoco.mjtDyn.mjDYN_NONE, np.eye(6)[0]
     servo.gainprm[:] = servo.biasprm[:] = 0.0
     servo.set_to_position(kp=stiffness, kv=damping)
     servo.ctrllimited = servo.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
     servo.forcelimited, servo.forcerange = force is not None, (-(force or 0.0), force or 0.0)
-    spec.joint(joint).actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # the effort of a URDF
+    spec.joint(joint).actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # no effort limit of a URDF
     return SERVO + joint
 
 
@@ -162,7 +162,7 @@ def at_home(spec: mujoco.MjSpec, home: dict[str, float]) -> tuple[mujoco.MjModel
 
 
 def stiffness(spec: mujoco.MjSpec, home: dict[str, float], frequency: float) -> list[float]:
-    """Return stiffnesses [N m/rad] with which joints, with the arm at `home`, have a natural frequency [rad/s]."""
+    """Return the stiffnesses [N m/rad] that give the joints a natural `frequency` [rad/s] with the arm at `home`."""
     model, data = at_home(spec, home)
     inertia = np.empty((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertia)
@@ -172,7 +172,7 @@ def stiffness(spec: mujoco.MjSpec, home: dict[str, float], frequency: float) -> 
 def add_tool(
     spec: mujoco.MjSpec, name: str, home: dict[str, float], base: Array, offset: Array
 ) -> tuple[Any, Array, Array]:
-    """Add the site of the tool at `offset` (3,) [m] from the site or body `name`, with the axes of that.
+    """Add the site of the tool at `offset` (3,) [m] from the site or body `name`, along the axes of that.
 
     The x axis is the one that points forward at `home`, the z axis the one that points down; `base` (3, 3) is the
     rotation of the base.

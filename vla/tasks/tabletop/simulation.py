@@ -56,12 +56,12 @@ class Simulation:
         high: Array,
         time_limit: float,
     ) -> None:
-        """Begin no episode yet.
+        """Store the parts; no episode has begun.
 
         Args:
             goal: goal, mixture of goals, or chain of goals.
             randomize: axis name → randomizer, or None to disable the axis.
-            compiled: the world.
+            compiled: the compiled scene.
             low: lower bounds (7,) of an action.
             high: upper bounds (7,) of an action.
             time_limit: time for an instruction, per block to be moved [s].
@@ -135,7 +135,7 @@ class Simulation:
         self.draws = {"named": self._named(), **self._axes, "language": language}
 
     def _begin(self, number: int) -> None:
-        """Start the time of a request, with the places where the blocks are now."""
+        """Start the clock of a request, with the blocks where they are now."""
         self.current, request = number, self.requests[number]
         self.goal, self.referents, self.instruction = request.goal, request.referents, request.instruction
         self._cached: tuple[float, WorldState] | None = None  # simulation time [s] and state
@@ -204,7 +204,7 @@ class Simulation:
         }
 
     def step(self, action: Array) -> None:
-        """Go through one control period, with targets interpolated linearly to those of the (7,) action."""
+        """Simulate one control period, with targets interpolated linearly to those of the (7,) action."""
         action = np.clip(action, self._low, self._high)
         if self.disturber:
             action = self.disturber.override(action)
@@ -215,7 +215,7 @@ class Simulation:
     def follow(self, joints: Array, opening: float, seconds: float) -> None:
         """Step physics for `seconds` with targets interpolated linearly to `joints` (J,) [rad] and an opening 0…1.
 
-        An arm that is pushed returns afterwards, because its driver does not know.
+        After a push the arm returns to these targets, because its driver does not know of the push.
 
         Raises:
             UserError: `seconds` is no whole number of physics steps.
@@ -306,7 +306,7 @@ class Simulation:
     def truth(self) -> dict[str, Array]:
         """Return the privileged state for experts, by name, of the current subgoal and its block; lengths in [m].
 
-        faces: cosine and sine of four times the yaw from the fingers to the block's faces, alike after a quarter turn.
+        faces: cosine and sine of four times the yaw from the fingers to the block's faces, invariant to quarter turns.
         """
         compiled, state, pose = self.compiled, self.world_state(), self.controller.pose
         now = current(self.goal.subgoals(state, self.referents))

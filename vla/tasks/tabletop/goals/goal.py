@@ -73,7 +73,7 @@ class Arrangement:
         return block in self.spots and self.spots[block][0] == "block"
 
     def allows(self, block: int) -> bool:
-        """Return whether the gripper can take a block, or has it: it holds no other, and none stands on it."""
+        """Return whether the gripper can take a block or holds it: no other block is held, and none stands on it."""
         return self.held in (None, block) and ("block", block) not in self.spots.values()
 
     def lifted(self, block: int) -> Arrangement:
@@ -81,7 +81,7 @@ class Arrangement:
         return Arrangement({other: spot for other, spot in self.spots.items() if other != block}, block)
 
     def put(self, block: int, spot: Spot) -> Arrangement | None:
-        """Return the arrangement with a block moved to a spot, and let go; None if that is not free, or on a tower."""
+        """Return the arrangement with a block released at a spot; None if the spot is taken, or is on a tower."""
         if spot in self.spots.values() or (spot[0] == "block" and self.stacked(spot[1])):
             return None
         return Arrangement({**self.spots, block: spot})
@@ -108,7 +108,7 @@ class Goal(ABC):
 
     Attributes:
         named: number of blocks that the instruction names.
-        moves: number of these to be moved.
+        moves: number of the named blocks to be moved.
         blocks: minimum number of blocks on the table.
         absent: minimum number of colours that no block has.
         pads: number of pads on the table.

@@ -22,7 +22,7 @@ class Mixed:
     """A mixture of goals, one drawn per episode; `blocks` and `absent` are the maxima over the goals.
 
     In a share of the episodes the instruction of the drawn goal names a block that is not on the table, and in another
-    share there is none: the robot must then leave everything in place.
+    share the instruction is empty: the robot must then leave everything in place.
     """
 
     def __init__(self, goals: Mapping[str, Goal | None], impossible: Share, silent: Share) -> None:
@@ -51,8 +51,8 @@ class Mixed:
 class Chain:
     """Several instructions in a row, each of which is given when the one before is completed.
 
-    They are drawn at the start of the episode, whoever acts. Each is feasible once the earlier ones are carried out: no
-    block is put where another one is or is taken from below another one, and what was lifted comes next.
+    All are drawn at the start of the episode, whatever the agent does. Each is feasible once the earlier ones
+    are carried out: no block is put where another one is or taken from below one, and a lifted block is named next.
 
     Attributes:
         blocks: minimum number of blocks on the table.
@@ -82,8 +82,8 @@ class Chain:
         return self
 
     def plan(self, blocks: int, random_state: np.random.RandomState) -> list[Link]:
-        """Draw the goals with what they name, from so many blocks: every goal that is possible is equally likely
-        (UserError: there is no such chain)."""
+        """Draw the goals and what they name, with `blocks` blocks on the table; every goal that is possible is equally
+        likely (UserError: there is no such chain)."""
         links = self._continued([], Arrangement(), blocks, random_state)
         if links is None:
             raise UserError(
@@ -95,7 +95,7 @@ class Chain:
     def _continued(
         self, links: list[Link], arrangement: Arrangement, blocks: int, random_state: np.random.RandomState
     ) -> list[Link] | None:
-        """Return the links with those that follow, or None if there is no way to go on."""
+        """Return the links completed to a whole chain, or None if that is impossible."""
         if len(links) == self.length:
             return links
         for goal in _shuffled(list(self.goals.values()), random_state):

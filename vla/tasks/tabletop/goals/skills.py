@@ -52,7 +52,7 @@ class PickPlace(Goal):
         return [self._placed(state, referents.blocks[0], referents.pads[0])]
 
     def _placed(self, state: WorldState, block: int, pad: int, further: bool = True) -> Subgoal:
-        """Return the subgoal that a block rests on a pad, released, and something `further` holds."""
+        """Return the subgoal that a block rests on a pad, released; it also takes the condition `further`."""
         there = state.away(block, state.pads[pad]) < self.radius and state.resting(block)
         return Subgoal(block, state.on_table(block, state.pads[pad]), "place", there and further)
 
@@ -136,7 +136,7 @@ class Stay(Goal):
 
     @classmethod
     def instead_of(cls, goal: Goal) -> Stay:
-        """Return the goal for the instructions of another one, but for the first block, which is absent."""
+        """Return the goal with the instructions of another one, except that their first block is absent."""
         return cls(goal.language.renamed({"block": "absent", "other": "block"}), goal.pads)
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
@@ -157,5 +157,5 @@ class Wait(Stay):
 
 
 def absent_colours_needed(language: Grammar) -> int:
-    """Return the number of colours to keep absent from the table, so that one of them is not held out from training."""
+    """Return how many colours to keep absent from the table, so that at least one of them is not held out."""
     return 1 + len(language.held_out_colours)

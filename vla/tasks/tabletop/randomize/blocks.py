@@ -18,7 +18,7 @@ from vla.tasks.tabletop.scene import COLOURS, PAD_RADIUS, PADS, ColourName
 
 ShapeName = Literal["cube", "cylinder", "tall", "flat"]
 SHAPES = {"cube": 1.0, "cylinder": 1.0, "tall": 1.25, "flat": 0.75}  # name → height over width
-HalfSize = Annotated[float, Ge(0.005), Le(0.034)]  # the Panda grasps it, the default clearance suffices [m]
+HalfSize = Annotated[float, Ge(0.005), Le(0.034)]  # for the Panda's gripper and the default clearance [m]
 HalfSizes = Annotated[tuple[HalfSize, HalfSize], Predicate(ascending)]
 ColourNames = Annotated[Sequence[ColourName], MinLen(1), Predicate(unique)]
 ROOM = 0.034  # radius reserved for a block: half the diagonal of the largest one of the default sizes [m]

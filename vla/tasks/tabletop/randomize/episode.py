@@ -1,4 +1,4 @@
-"""Randomizers of what is said and of what happens in the course of an episode."""
+"""Randomizers of the instruction, and of events in the course of an episode."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Phrasing:
 
 @dataclass(frozen=True)
 class Paraphrase:
-    """Other words for the blocks and pads that an instruction of an evaluation names."""
+    """Other words for the blocks and pads that are named in the instructions of an evaluation."""
 
     words: Annotated[Mapping[str, Words], MinLen(1)]  # phrase of an instruction → phrases to draw from in its place
 
@@ -44,7 +44,7 @@ class Paraphrase:
 
 @dataclass(frozen=True)
 class TargetChoice:
-    """Choice of another target block than the unmodified episode has, in the same scene."""
+    """Choice of a target block other than that of the unmodified episode, in the same scene."""
 
     skip: Natural  # number of blocks to skip in the order of naming
 
@@ -76,17 +76,17 @@ class Disturbances:
     """Pushes of the arm, drops of the held block, and moves of the block or its destination, one kind per episode."""
 
     kinds: Annotated[Sequence[Kind], MinLen(1), Predicate(unique)]  # to draw from
-    times: NaturalRange  # range of how often it happens
+    times: NaturalRange  # range of the number of disturbances in an episode
     start: NaturalRange  # range of the number of control steps before a push, not counting the first step
     delay: NaturalRange  # the same for other kinds: steps whose preconditions hold before the disturbance happens
     push: Lengths  # range of the distance by which the arm is pushed [m]
-    move: Lengths  # of that by which an object is moved [m]
+    move: Lengths  # range of the distance by which an object is moved [m]
     x: Places  # area of the table in which a push or a move ends [m]
     y: Places
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw kind, number, time, distance and direction; whether it happens also depends on the agent."""
-        # The same numbers at every level.
+        # Every level draws the same random numbers.
         kind, times, delay, distance, angle = random_state.uniform(size=5).tolist()
         chosen = self.kinds[int(kind * len(self.kinds))]
         number = _whole(self.times, times)
@@ -106,6 +106,6 @@ class Disturbances:
 
 
 def _whole(bounds: tuple[int, int], share: float) -> int:
-    """Return the integer of a range, ends included, at a share 0…1 of it."""
+    """Return the integer at a share [0, 1) of a range, both ends included."""
     low, high = bounds
     return low + int(share * (high - low + 1))

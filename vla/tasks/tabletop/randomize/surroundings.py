@@ -23,7 +23,7 @@ class Light:
 
     brightness: NonNegativeRange | None  # range of brightness, 1: white; or None for the nominal one
     tint: Share  # maximum change of each channel
-    tilt: Angle  # maximum tilt about both horizontal axes, if the lamp hung straight above [rad]
+    tilt: Angle  # maximum tilt about both horizontal axes, as for a lamp straight above [rad]
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw the properties of the directional lamp."""
@@ -44,7 +44,7 @@ class Cameras:
     position: Length  # maximum shift along each axis [m]
     rotation: Angle  # maximum rotation about each axis [rad]
     fovy: Annotated[float, Ge(0), Le(30)]  # maximum change of the field of view [degrees]
-    wrist: Share  # share of all three for the wrist camera, which is mounted rigidly
+    wrist: Share  # factor on all three for the wrist camera, which is mounted rigidly
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw a mounting error per camera."""
