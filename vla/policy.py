@@ -26,7 +26,7 @@ from vla.models.model import Model
 from vla.schedule import Schedule
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Running, Spec
 
-Seen = Observation | Mapping[str, Any] | Sequence[Observation]  # by one lane, or by several
+Seen = Observation | Mapping[str, Any] | Sequence[Observation]  # of one lane, or of several
 NOTHING = Running(np.empty((0, 1), np.float32), 0)  # no plan is executed
 LONG_SENTENCE = " ".join(["sentence"] * 24)  # shorter instructions are padded to it for a constant shape
 
@@ -46,12 +46,12 @@ class Lane:
 
 
 class Policy:
-    """Agents around a model: each caches encoded frames of its history, and executes the first actions of each chunk.
+    """Agents that share a model: each caches encoded frames of its history, and executes the first actions of a chunk.
 
-    Every lane, named by a number, is an agent in an episode of its own, and acts the same, bit for bit, whatever the
-    others do and however many they are. The rounding of a product depends on its shape and on the row: so the model
-    always computes `lanes` rows, with padding in unused ones, and an episode has the row of its seed modulo `lanes`.
-    Lanes of the same row, or with instructions of different lengths, take several passes.
+    Every lane, identified by a number, is an agent in its own episode. Its actions are bit-identical whatever the other
+    lanes do and however many there are: the rounding of a matrix product depends on its shape and on the row, so the
+    model always computes `lanes` rows, padding unused ones, and an episode uses row `seed % lanes`. Lanes with the same
+    row, or with instructions of different lengths, are computed in separate passes.
 
     Args:
         device: "auto" is a GPU if there is one.
@@ -59,12 +59,12 @@ class Policy:
         compile: compile the model, which takes up to a minute at the first action and needs g++ on a CPU. On a GPU
             CUDA graphs are used. Weights stay inputs of the graphs, so that models of one class share them.
         lanes: rows of every pass through the model.
-        chunking: how plans continue those that `Observation.running` says are executed meanwhile; None: they do not.
+        chunking: how a plan continues the running one (`act`: the lane's last, `plan`: `Observation.running`), or None.
         model: the network, with its tokenizer.
         spec: observation and action spaces.
 
     Raises:
-        UserError: device="cuda" without a GPU, or a `chunking` that the model cannot do.
+        UserError: device="cuda" without a GPU, or a `chunking` that the model does not support.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Policy:
             require_chunking(type(chunking), type(model), model.prefix)
             model.chunking = chunking
         self.execute = model.execute  # number of actions of a chunk to execute
-        self.history = model.history  # number of frames it looks at; with several it wants to see every one
+        self.history = model.history  # number of input frames; if several, it must be given every observation
         self._bf16 = precision == "bf16"
         self._encode, self._predict_chunk = self.model.encode, self.model.predict
         self._padding_sentences = [LONG_SENTENCE] if compile else []
@@ -104,8 +104,8 @@ class Policy:
     def reset(self, instruction: str, seed: int, lane: int = 0) -> None:
         """Start an episode in a lane: clear its history, and seed its noise.
 
-        Observations of a lane that was never reset start an episode with the lane's number as its seed; those with
-        another instruction than before start one with the same seed.
+        The first observation of a lane that was never reset starts an episode with the lane's number as its seed. An
+        observation with a new instruction starts one with the seed of the episode before it.
 
         Raises:
             UserError: the instruction has more than `LONGEST_INSTRUCTION` characters.
@@ -126,19 +126,19 @@ class Policy:
         return self._lanes[lane].info
 
     def looking(self, lane: int) -> bool:
-        """Return whether the next action of a lane is not chosen yet, or its observation is part of a history."""
+        """Return whether `act` uses the next observation of a lane, for a new plan or for the history."""
         return self._wants_plan(lane) or self.history > 1
 
     def _wants_plan(self, lane: int) -> bool:
         return self._lanes[lane].schedule.wants_plan(self._lanes[lane].step, self.execute)
 
     def act(self, observations: Seen, lanes: Sequence[int] | None = None) -> Array:
-        """Return the actions to execute, (n, D) float32, clipped to the spec, of n lanes, given what each of them sees.
+        """Return the next actions of n lanes, (n, D) float32, clipped to the spec, given an observation of each.
 
         Without `lanes`, return the action (D,) for one observation of lane 0, also one of `vla.api.load_environment`.
 
         Raises:
-            UserError: an observation does not match the spec; no lane has acted then.
+            UserError: an observation does not match the spec, in which case no lane acts.
         """
         if lanes is None:
             return self.act([self._one(observations)], [0])[0]
@@ -158,7 +158,7 @@ class Policy:
         return np.stack(chosen)
 
     def plan(self, observations: Seen, lanes: Sequence[int] | None = None) -> Array:
-        """Return chunks of actions, (n, k, D) float32, clipped to the spec, of which a caller executes the first.
+        """Return chunks of actions, (n, k, D) float32, clipped to the spec; the caller executes the first of each.
 
         Without `lanes`, return the chunk (k, D) for the one observation of lane 0. Raises as `act`.
         """
@@ -182,7 +182,7 @@ class Policy:
         return seen
 
     def _observe(self, seen: Mapping[int, Observation]) -> None:
-        """Encode the observations of lanes, and add them to the histories; all, or none if one does not fit."""
+        """Encode the observations of lanes and add them to the histories, or none if one does not match the spec."""
         for rows, frames in self._passes({lane: self.frame(observation, lane) for lane, observation in seen.items()}):
             with self._computing():
                 tokens = self._encode(frames)
@@ -195,9 +195,9 @@ class Policy:
                 self._lanes[lane].frames.append({name: values[row : row + 1] for name, values in kept.items()})
 
     def _predict(self, lanes: Mapping[int, Running]) -> dict[int, list[tuple[Array, dict[str, Any]]]]:
-        """Return lane → its chunk of clipped actions, (D,) each, with what is known about each.
+        """Return lane → its chunk of clipped actions, (D,) each, with the `info` of each.
 
-        With `chunking` a chunk begins with those actions of the running plan that are over when it arrives.
+        With `chunking`, a chunk begins with the actions of the running plan that are executed before it arrives.
         """
         chunks = {}
         for rows, windows in self._passes({lane: self._inputs(lane, plan) for lane, plan in lanes.items()}):
@@ -302,14 +302,14 @@ def _joined(batches: Sequence[Batch]) -> Batch:
 
 
 def costs(policy: Policy) -> dict[str, float]:
-    """Return the number of parameters of a policy and its latency [ms], under the names of a report's file."""
+    """Return the number of parameters of a policy and its latency [ms], under their names in the file of a report."""
     return {"parameters": sum(p.numel() for p in policy.model.parameters()), "latency_ms": latency(policy)}
 
 
 def latency(policy: Policy) -> float:
     """Measure the time from an observation to its action with a full history [ms].
 
-    It is the smallest of five medians over five plans, because other load only adds time.
+    The result is the smallest of five medians of five plans each, because other load on the machine only adds time.
     """
     observation = policy.spec.random_observation(np.random.default_rng(0))
     for _ in range(policy.model.history):

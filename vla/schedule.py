@@ -1,7 +1,7 @@
-"""The one schedule of planned actions: a plan is executed while the next one is computed.
+"""The schedule of planned actions, wherever a plan is executed while the next one is computed.
 
-Policies, simulated networks and clients of a policy server count in executed actions, so that no action becomes
-obsolete while an arm holds for lack of one; a robot counts in seconds on its clock.
+Policies, simulated networks and clients of a policy server count time in executed actions, so that no action expires
+while an arm without a due action holds still; a robot counts in seconds on its clock.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Action = TypeVar("Action")
 
 @dataclass(frozen=True)
 class Plan(Generic[Action]):
-    """Actions that follow each other, with the times at which they end."""
+    """Consecutive actions, with the times at which they end."""
 
     start: float
     actions: Sequence[Action]
@@ -29,7 +29,7 @@ class Schedule(Generic[Action]):
     """Which action of which plan is due at which time; plans overlap where one begins before another has ended."""
 
     def __init__(self, period: float = 1.0) -> None:
-        """Start without a plan; every action takes a `period`: one step, or [s] on a clock."""
+        """Start without a plan; every action takes one `period`: 1 if time counts steps, or [s] on a clock."""
         self._period = period
         self._plans: list[Plan[Action]] = []  # in the order in which they were added
 
@@ -44,19 +44,19 @@ class Schedule(Generic[Action]):
         return self._plans[-1].ends[-1] if self._plans else -math.inf
 
     def add(self, actions: Sequence[Action], start: float) -> None:
-        """Add a plan, at least one action, made from what was seen at `start`, where its first action begins.
+        """Add a plan of at least one action, made from the observation at time `start`, when its first action begins.
 
-        It may arrive later: actions whose time has passed by then are never due.
+        The plan may arrive later: actions whose time has passed by then are never due.
         """
         ends = [start + self._period * (place + 1) for place in range(len(actions))]
         self._plans = [*(plan for plan in self._plans if plan.ends[-1] > start), Plan(start, actions, ends)]
 
     def executed(self, execute: int) -> float:
-        """Return the time at which `execute` actions of the newest plan are over; -∞ without one."""
+        """Return the time at which the first `execute` actions of the newest plan have ended; -∞ without a plan."""
         return self._plans[-1].start + self._period * execute if self._plans else -math.inf
 
     def wants_plan(self, time: float, execute: int) -> bool:
-        """Return whether `execute` actions of the newest plan are over, so that the next observation is due."""
+        """Return whether the first `execute` actions of the newest plan have ended, so that a new plan is due."""
         return time >= self.executed(execute)
 
     def remaining(self, time: float) -> Sequence[Action]:
@@ -81,5 +81,5 @@ class Delays:
 
     @property
     def longest(self) -> int:
-        """How many actions will be over when the next plan arrives."""
+        """How many actions will have ended when the next plan arrives."""
         return math.ceil(max(self._seconds, default=0.0) / self._period - 1e-9)

@@ -110,7 +110,7 @@ class WindowDataModule(LightningDataModule):
         validation_windows: approximate number of held-out windows per validation, over all processes.
         ahead: batches made in advance.
         tokenize: sentences → tensor, added to batches as `text`; None adds nothing.
-        episodes: use only the first so many episodes; all of them when None.
+        episodes: number of episodes to use, the first ones; None: all.
         more: further episode stores, all of whose episodes are used; they may lack the simulator's truth.
     """
 
@@ -137,7 +137,7 @@ class WindowDataModule(LightningDataModule):
         self._fraction, self._validation_windows = validation_fraction, validation_windows
 
     def setup(self, stage: str | None = None) -> None:
-        """Open the stores and split their episodes; a UserError if they do not fit, or are too few to split."""
+        """Open the stores and split their episodes; a UserError if they do not match the spec, or are too few."""
         stores = [EpisodeStore(self._folder, self._episodes), *map(EpisodeStore, self._more)]
         rows = [max((entry.end for entry in store.episodes), default=0) for store in stores]
         trained, unseen = list[Array](), list[Array]()
@@ -162,9 +162,9 @@ class WindowDataModule(LightningDataModule):
         self._batchers, self._starts = [WindowBatcher(store, *layout) for store in stores], np.cumsum([0, *rows])[:-1]
 
     def make_batch(self, windows: Array) -> Batch:
-        """Return the batch of `windows` (B,), row numbers store by store; its windows are in the order of their stores.
+        """Return the batch of `windows` (B,), row numbers counted over all stores; its windows are sorted by store.
 
-        There is a UserError as of `WindowBatcher`.
+        Raises as `WindowBatcher` does.
         """
         store = self._starts.searchsorted(windows, side="right") - 1
         numbers = np.unique(store).tolist()
@@ -172,7 +172,7 @@ class WindowDataModule(LightningDataModule):
         return parts[0] if len(parts) == 1 else joined(parts)
 
     def verify(self) -> None:
-        """Raise a UserError if images differ from their checksums, which otherwise the first batch of each tells."""
+        """Raise a UserError if images differ from their checksums; otherwise an episode is verified when first read."""
         for batcher in self._batchers:
             batcher.verify()
 
@@ -213,7 +213,7 @@ class WindowDataModule(LightningDataModule):
     def order(self, step: int, rank: int = 0, processes: int = 1) -> Array:
         """Return the windows (B,) of training step `step` in process `rank`, as row numbers.
 
-        The order is a sequence of permutations of all windows, divided into runs of B.
+        The order is a sequence of permutations of all windows, divided into batches.
         """
         first = (step * processes + rank) * self.batch_size
         count = len(self.training_windows)

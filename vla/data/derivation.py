@@ -29,12 +29,12 @@ Chosen = dict[str, dict[int, list[tuple[EpisodeStore, Entry]]]]  # config as JSO
 def derive_store(
     stores: Sequence[EpisodeStore], folder: Path, where: Mapping[str, Any] | None = None, repair: bool = False
 ) -> list[int]:
-    """Write a new store of the episodes in others of the same spec that match `where`, atomically (UserError: the
-    folder exists, or another process writes it; specs differ, nothing matches, or an episode is damaged).
+    """Write a new store of the episodes that match `where` in `stores` of one spec, atomically (UserError: the folder
+    exists, or another process writes it; specs differ, nothing matches, or an episode is damaged).
 
-    Seeds are in order, config by config. Of the same seed and config one undamaged episode is kept. If there is one
-    config and no seed is missing between the first and the last, the new store equals a collected one, and can grow.
-    With `repair` an episode may be damaged: if it is in all sources, it becomes a failed seed. Returns these seeds.
+    Episodes are sorted by seed within each config. Of those with the same seed and config, one undamaged one is kept.
+    The store equals a collected one, and can grow, if it has one config, no gaps in its seeds, no filter and one codec
+    loss. With `repair`, an episode that is damaged in all sources becomes a failed seed. Returns the seeds of these.
     """
     for store in stores[1:]:
         store.spec.require(stores[0].spec, f"the episode store {store.folder}", f"{stores[0].folder}")
@@ -51,7 +51,7 @@ def derive_store(
         if folder.exists():
             raise UserError(f"{folder} exists already and is left alone: choose another inspect.into")
         codecs = {store.codec for store in stores}
-        codec = Codec("lossless") if len(codecs) > 1 else codecs.pop()  # nothing more is lost
+        codec = Codec("lossless") if len(codecs) > 1 else codecs.pop()  # no further loss
         new = EpisodeStore.create_or_open(draft, stores[0].spec, _config(chosen, stores, where), codec)
         with new.writing():
             seeds = [(seed, copies) for part in chosen.values() for seed, copies in sorted(part.items())]
@@ -59,12 +59,12 @@ def derive_store(
         os.rename(draft, folder)
     except BaseException as error:
         shutil.rmtree(draft, ignore_errors=True)
-        if isinstance(error.__cause__, OSError):  # whose message, of a store that grows, does not apply here
+        if isinstance(error.__cause__, OSError):  # its message is about a store that grows, and does not apply here
             reason = f"{folder} cannot be written ({error.__cause__.strerror}), nothing of it is kept"
             raise UserError(f"{reason}: make room there, or choose another inspect.into") from error
         raise
     finally:
-        Path(lock.lock_file).unlink(missing_ok=True)  # while it is held: who comes later makes a new one
+        Path(lock.lock_file).unlink(missing_ok=True)  # while it is held: a later process creates a new one
         lock.release()
     return damaged
 
@@ -81,7 +81,7 @@ def _choose(stores: Sequence[EpisodeStore], where: Mapping[str, Any]) -> Chosen:
 
 
 def _config(chosen: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the config that the episodes were collected with, if one collection could have; else `Derived`."""
+    """Return the config of the episodes if one collection could have produced them all, else that of `Derived`."""
     conditions = [condition for store in stores if store.derived for condition in store.config["where"]]
     conditions += [dict(where)] if where else []
     (config, seeds), *others = chosen.items()

@@ -36,8 +36,8 @@ def leaves(value: Any) -> list[Any]:
 
 
 def episode_filter(where: Mapping[str, Any], entries: Iterable[Entry]) -> Callable[[Entry], bool]:
-    """Return the predicate of index entries that have a value of every name in `where`, and whose values all match
-    (UserError: a name occurs in no entry, or a condition is of another kind).
+    """Return the predicate of index entries that have every name in `where`, with values that all match (UserError:
+    a name occurs in no entry, or a condition is of another kind).
 
     Args:
         where: name of a fact → condition.

@@ -5,7 +5,7 @@ A folder holds `store.json` (the layout of the rows), the files of every field (
 so a process killed at any moment leaves at most rows without a line, which the next writer truncates. The bytes depend
 on the episodes only, never on time or on the number of processes.
 
-A collected store holds consecutive seeds of one config and can grow. A derived store (`vla.data.verification`) lists
+A collected store holds consecutive seeds of one config and can grow. A derived store (`vla.data.derivation`) lists
 the configs of its sources as `parts`, holds any seeds, and cannot grow.
 
 Images are raw or compressed one by one. A codec without loss changes neither config nor checksums of the episodes.
@@ -36,7 +36,7 @@ from vla.io.files import require_file
 from vla.parallel.limits import memory
 from vla.spec import FIRST_SEED, Array, Episode, Observation, Spec
 
-IN_MEMORY = 0.25  # largest share of the memory that a store takes that is expected to stay in it
+IN_MEMORY = 0.25  # a store is expected to stay in memory if it takes at most this share of it
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ class DamageError(UserError):
 
 class EpisodeStore:
     """Episodes on disk, opened for reading; `create_or_open` and `writing` extend it (UserError: the folder holds no
-    store, or one that has another format, is damaged, or is too short).
+    store, or one that has another format, is damaged, or has too few episodes).
 
     Attributes:
         header: content of `store.json`.
@@ -60,11 +60,11 @@ class EpisodeStore:
         fields: field → shape and dtype of a row, see `fields_of`.
         codec: of the images.
         tried: one entry per seed.
-        episodes: those of the stored episodes, of seeds that succeeded and of labelled failures; at most `episodes`.
+        episodes: entries of the stored episodes, successes and labelled failures; at most `episodes`.
 
     Args:
         folder: of the store.
-        episodes: use only the first so many; all of them when None.
+        episodes: number of episodes to use, the first ones; None: all.
         damaged: also open a store with truncated files or unreadable index lines; the seeds of the latter are `LOST`.
     """
 
@@ -85,8 +85,8 @@ class EpisodeStore:
     def create_or_open(
         cls, folder: str | Path, spec: Spec, config: Mapping[str, Any], codec: Codec | None = None
     ) -> EpisodeStore:
-        """Open the store in `folder`, or create an empty one, whose codec is by default that for its size of images
-        (UserError: the store has another spec or config, other losses than `codec`, or lacks its `store.json`)."""
+        """Open the store in `folder`, or create an empty one, whose codec by default suits its image size (UserError:
+        the store has another spec or config, other losses than `codec`, or lacks its `store.json`)."""
         folder, plain = Path(folder), json.loads(dumps(config))
         if not is_store(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -99,7 +99,7 @@ class EpisodeStore:
         return store
 
     def require(self, config: Mapping[str, Any]) -> None:
-        """Raise a UserError if the episodes have another config, unless they were chosen explicitly."""
+        """Raise a UserError if the episodes have another config; a derived store, chosen explicitly, may have any."""
         if self.derived:
             return
         wanted, stored = canonical(json.loads(dumps(config))), canonical(self.config)
@@ -108,12 +108,12 @@ class EpisodeStore:
             raise UserError(f"{self.folder} was collected with another config for {different}: choose another folder")
 
     def lacks(self, key: str, node: Any) -> bool:
-        """Return whether no part of a derived store has a node of the config."""
+        """Return whether the store is derived, and no part of it has `node` under `key` in its config."""
         wanted = canonical(json.loads(dumps(node)))
         return self.derived and all(canonical(config.get(key)) != wanted for config, _ in self.config["parts"])
 
     def require_codec(self, codec: Codec | None) -> None:
-        """Raise a UserError if the images have other losses than those of `codec`; None: whatever they have."""
+        """Raise a UserError if the images have other losses than those of `codec`; None accepts any."""
         if codec is not None and codec.loss != self.codec.loss:
             raise UserError(
                 f"{self.folder} holds {self.codec}, not {codec}: choose another folder, or omit collect.images"
@@ -154,14 +154,14 @@ class EpisodeStore:
         return Statistics(self.numbers("action"), np.array([entry.end for entry in self.episodes]))
 
     def numbers(self, field: str) -> Array:
-        """Return the rows of a field of numbers in `episodes`, (N, …); there may be more in the store."""
+        """Return the rows of a numeric field in `episodes`, (N, …), without those of further episodes in the store."""
         return np.asarray(self.rows(field))[: self.episodes[-1].end]
 
     def rows(self, field: str, scattered: bool = False) -> Rows:
         """Return all committed rows of `field`, (N, …), which are read when they are indexed.
 
-        Compressed images are `ScatteredRows`, which raise a DamageError for a damaged image; so are the rows of a large
-        store that are `scattered`, which means read in random order. All other rows are a memory-mapped array.
+        Compressed images, and rows of a large store that will be read in random order (`scattered`), are
+        `ScatteredRows`, which raise a DamageError for a damaged image. All other rows are a memory-mapped array.
         """
         if field not in self.fields:
             raise UserError(f"{self.folder} has no field {field!r}: it has {sorted(self.fields)}")
@@ -172,12 +172,12 @@ class EpisodeStore:
         return self._columns[field].rows(self._rows, partial(self._image_changed, field), scattered and large)
 
     def packed(self, entry: Entry) -> dict[str, list[bytes]]:
-        """Return the images of an episode as they are compressed, by field; a DamageError if one is damaged."""
+        """Return the compressed images of an episode, by field; a DamageError if one is damaged."""
         sources = {field: self.rows(field) for field in self.fields}
         return {field: rows.packed(entry.span) for field, rows in sources.items() if isinstance(rows, ScatteredRows)}
 
     def size(self, field: str, entry: Entry) -> int:
-        """Return how many bytes of the disk a field of an episode takes."""
+        """Return the size of a field of an episode on disk [bytes]."""
         before, after = (self._columns[field].sizes(rows) for rows in (entry.start, entry.end))
         return sum(after) - sum(before)
 
@@ -223,7 +223,7 @@ class EpisodeStore:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Lock the store for writing, after any other writer, and truncate what a killed one left incomplete."""
+        """Lock the store for writing, waiting for any other writer, and truncate what a killed one left incomplete."""
         assert not self._damaged, "a damaged store is left as it is"
         lock = FileLock(self.folder / "lock")
         try:
@@ -235,7 +235,7 @@ class EpisodeStore:
             stack.callback(lock.release)
             self._refresh()
             paths = (self._index, *(path for column in self._columns.values() for path in column.files))
-            for path in paths:  # an archive keeps links: what is behind them would be overwritten
+            for path in paths:  # an unpacked archive may contain links, whose targets would be overwritten
                 require_file(path)
                 if path.is_symlink():
                     raise UserError(f"{path} is a link, and nothing is added behind one: copy the file to this place")
@@ -252,7 +252,7 @@ class EpisodeStore:
         """Store an episode atomically: a success, or a failure whose labels are to be kept (UserError: it does not
         match the spec, has several instructions or another seed than the next, or cannot be written).
 
-        `packed` are its images as another store with the same codec keeps them: JPEG is not compressed a second time.
+        `packed` are its compressed images from another store with the same codec, so that JPEG loses nothing more.
         """
         if len({seen.instruction for seen in episode.observations}) > 1:
             raise UserError(
@@ -261,7 +261,7 @@ class EpisodeStore:
             )
         rows = rows_of(self.spec, episode)
         pieces = {name: self._columns[name].pieces(self._rows, rows[name], (packed or {}).get(name)) for name in rows}
-        # JPEG by the bytes of its files: what a decoder makes of them depends on its rounding.
+        # Checksums of JPEG are of the compressed bytes, because decoders differ in rounding.
         jpeg = [name for name in rows if self.codec.of(name) == "jpeg"]
         crc = {name: zlib.crc32(pieces[name][0] if name in jpeg else rows[name].data) for name in rows}
         self._commit(self._entry(episode, crc), pieces)
@@ -271,7 +271,7 @@ class EpisodeStore:
         self._commit(self._entry(episode, {}), {})
 
     def _entry(self, episode: Episode, crc: dict[str, int]) -> Entry:
-        """Return the index entry of an episode, of which rows are stored if they have checksums."""
+        """Return the index entry of an episode, whose rows are stored if `crc` has their checksums."""
         return Entry(
             seed=episode.seed,
             task=episode.task,
@@ -317,7 +317,7 @@ class EpisodeStore:
                 self._files[path].truncate(size)
 
     def _refresh(self) -> None:
-        """Read the index: what counts is what it names, whatever else the files of the fields hold."""
+        """Read the index, which alone says what the store holds, whatever else the files of the fields contain."""
         files = [column.files[0] for column in self._columns.values()]
         if not self._index.exists() and (there := [path for path in files if path.exists()]):
             raise UserError(f"{self._index} is missing, which {there[0].name} beside it needs: {REMEDY}")
@@ -368,7 +368,7 @@ def observations_of(spec: Spec, rows: Mapping[str, Array], instruction: str) -> 
 
 
 def _checksum(rows: Rows, span: slice, values: Array | None = None) -> int:
-    """Return the CRC-32 of the rows in `span`, which are `values`, or of the files of JPEG."""
+    """Return the CRC-32 of the rows in `span`, `values` if they were read already; for JPEG of the compressed bytes."""
     if isinstance(rows, ScatteredRows) and rows.codec == "jpeg":
         return zlib.crc32(b"".join(rows.packed(span)))
     return zlib.crc32((rows[span] if values is None else values).data)

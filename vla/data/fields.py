@@ -28,11 +28,11 @@ Damaged = Callable[[int], UserError]  # row → the error to raise
 class ScatteredRows:
     """Array-like rows that are read one by one, in random order, and decoded by one thread per core.
 
-    Of a memory-mapped array the kernel reads ahead, on some machines by megabytes; of a file that is larger than the
-    free memory, most of that is evicted before it is used. Here the kernel reads the rows of a batch and nothing else.
+    In a memory-mapped array the kernel reads ahead, on some machines by megabytes; if the file is larger than the free
+    memory, most of that is evicted before it is used. Here the kernel reads the rows of a batch and nothing else.
 
     Args:
-        field: whose rows they are.
+        field: the field of the rows.
         count: number of rows N.
         damaged: makes the error for a row that cannot be read.
     """
@@ -75,12 +75,12 @@ class ScatteredRows:
         return out
 
     def packed(self, rows: slice) -> list[bytes]:
-        """Return consecutive rows as they are compressed."""
+        """Return consecutive rows in compressed form."""
         index = np.arange(*rows.indices(len(self)))
         return [self._packed(row, *place) for row, place in zip(index.tolist(), self._places(index), strict=True)]
 
     def _places(self, rows: Array) -> list[tuple[int, int]]:
-        """Return offset and size [bytes] of rows in the file, which the kernel begins to read."""
+        """Return offset and size [bytes] of rows in the file, and make the kernel begin to read them."""
         if self._ends is None:
             places = [(row * self._size, self._size) for row in rows.tolist()]
         else:
@@ -142,7 +142,7 @@ class Field:
         return np.asarray(np.memmap(self.files[0], self.dtype, mode="r", shape=(count, *self.shape)))
 
     def pieces(self, rows: int, values: Array, packed: Sequence[bytes] | None) -> list[bytes | memoryview]:
-        """Return what every file gets when `values` (N, …) follow `rows` rows; `packed` are the same, compressed."""
+        """Return the bytes to append to every file for `values` (N, …) after `rows` rows; `packed`: compressed ones."""
         if self.codec == "raw":
             return [values.data.cast("B")]
         images = list(packed) if packed is not None else [b""] * len(values)

@@ -24,7 +24,7 @@ LARGEST_RAW = 128  # height and width of the images that are stored raw unless a
 
 @dataclass(frozen=True)
 class Codec:
-    """How a store keeps its images. Depth loses nothing: it is lossless where colour is JPEG."""
+    """How a store encodes its images. Depth is never lossy: it is lossless where colour is JPEG."""
 
     __pydantic_config__ = STRICT
 
@@ -42,7 +42,7 @@ class Codec:
 
     @property
     def loss(self) -> Codec:
-        """What two codecs share that give back the same images."""
+        """The lossy part of the codec, equal for codecs that decode to the same images."""
         return self if self.images == "jpeg" else RAW
 
     def of(self, field: str) -> Images:

@@ -1,7 +1,7 @@
 """Codecs of single images: Zstandard, without loss, and JPEG.
 
-Zstandard at its fastest level makes rendered images as small as PNG does, and unpacks them four times as fast. Of
-images with the noise of a camera it saves only a fourth, JPEG nine tenths.
+Zstandard at its fastest level makes rendered images as small as PNG does, and unpacks them four times as fast. On
+images with camera noise it saves only a quarter, JPEG nine tenths.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ def decode(packed: bytes, codec: Images, shape: tuple[int, ...], dtype: np.dtype
 
 
 def _unpack_jpeg(packed: bytes) -> Array:
-    """Decode a JPEG by TorchVision: the bits are Pillow's, which takes a third longer and copies the image twice.
+    """Decode a JPEG by TorchVision, bit-identical to Pillow, which takes a third longer and copies the image twice.
 
-    Neither unpacks more than the few bytes hold: memory of an untrue size is reserved, but not touched.
+    Neither decodes more than the file contains: for a false size in its header, memory is reserved but not touched.
     """
     import torch  # takes a second
     from torchvision.io import ImageReadMode, decode_jpeg

@@ -22,7 +22,7 @@ REMEDY = "copy the folder again from where it is whole, or delete it and collect
 SALVAGE = f"keep what is whole with job=inspect inspect.repair=true, {REMEDY}"
 DAMAGED = "damaged"  # outcome of a seed whose episode a repair could not save
 LOST = "lost"  # outcome of a seed whose index line is unreadable
-NOT_NEEDED = "not_needed"  # outcome of a seed that was passed over, because its task had its share of episodes
+NOT_NEEDED = "not_needed"  # outcome of a seed that was skipped, because its task had its share of episodes
 CHECK = b', "check": '  # precedes the CRC-32 of the line without it, at the end of every line
 MAX_INDEX_BYTES = 4 << 30  # millions of seeds
 MAX_LISTED = 8  # largest number of numbers in a message
@@ -83,7 +83,7 @@ class Entry:
 
 
 def recording_of(seed: int, draws: Mapping[str, Any]) -> int:
-    """Return the number of the recorded episode that an episode was or is a part of; its seed if it was not recorded.
+    """Return the number of the recorded episode that an episode is, or is a part of; its seed if it was not recorded.
 
     Parts of one recording show the same scene: they are held out together, and count as one in statistics.
     """
@@ -173,7 +173,7 @@ def _with_lost(entries: dict[int, Entry], lines: int) -> list[Entry]:
     """Return the readable entries with a `LOST` one for every seed between, before and after them that has none."""
     first, last = min(entries), max(entries)  # numbers of lines
     oldest, newest = entries[first], entries[last]
-    cut_off = int(first == 1 and oldest.start > 0)  # lines at the start: the rows before the first one's were another's
+    cut_off = int(first == 1 and oldest.start > 0)  # lines at the start: the first rows belong to a lost entry
     seeds = range(max(oldest.seed - first + 1 - cut_off, 0), newest.seed + lines - last + 1)
     if len(seeds) > 2 * lines:  # a damaged line end joins two lines, so there are at most two seeds to a line
         raise UserError(f"the readable seeds, {oldest.seed} to {newest.seed}, are too far apart: {REMEDY}")

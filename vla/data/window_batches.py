@@ -46,7 +46,7 @@ class BufferPool:
     def empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Array:
         """Return an array with arbitrary content.
 
-        Torch allocates it, at a cache line; NumPy's arrays start beside one, where some processors copy half as fast.
+        Torch aligns it to a cache line; NumPy does not, which halves the speed of copies on some processors.
         """
         length, *rest = shape
         arrays = self._arrays.setdefault((*rest, dtype), [])
@@ -61,7 +61,7 @@ class BufferPool:
 class WindowBatcher:
     """Callable that copies windows of an episode store into batches; a window is identified by its newest row.
 
-    The numeric rows of the store are verified at once, a UserError if they differ from their checksums.
+    The numeric rows of the store are verified on construction; a UserError if they differ from their checksums.
 
     Args:
         store: source of the rows.
@@ -84,7 +84,7 @@ class WindowBatcher:
         store.verify(store.episodes, numbers)
         self._size, self._truth_size = (spec or store.spec).image_size, (spec or store.spec).truth_size
         known = [numbers[name][:] for name in names]
-        # Truth that this store lacks, and others beside it have.
+        # NaN in place of truth that other stores have but this one lacks.
         unknown = np.full((len(known[0]), self._truth_size - store.spec.truth_size), np.nan, np.float32)
         self._numbers = np.concatenate([*known, unknown], axis=1)
         label, executed = numbers["action"][:], numbers["executed"][:]
@@ -157,7 +157,7 @@ class WindowBatcher:
         return self._buffers.empty(shape, dtype)
 
     def _own(self, tensor: torch.Tensor) -> torch.Tensor:
-        """Return a tensor as a GPU reads it: page-locked and without gaps, which would be closed in other memory."""
+        """Return a tensor, for a GPU page-locked and contiguous: a strided one would be copied elsewhere first."""
         return tensor.contiguous().pin_memory() if self._pin else tensor
 
 

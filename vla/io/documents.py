@@ -21,12 +21,12 @@ T = TypeVar("T")
 
 MAX_BYTES = 64 << 20  # [bytes] of a file
 MAX_YAML_BYTES = 1 << 20  # [bytes] of a YAML file, which is slow to parse
-MAX_RESOLVED_BYTES = 4 << 20  # [bytes] of a configuration, which takes thirty times as much before it is counted
+MAX_RESOLVED_BYTES = 4 << 20  # [bytes] of a configuration, which takes thirty times as much memory before it is counted
 MAX_VALUES = 100_000  # values in a configuration
 LONG_NUMBER = re.compile(r"[-+.:\d_]{100,}")  # in base 60, 1:1:1:…, a megabyte takes minutes
 MAX_DEPTH = 64  # nesting levels in YAML; pydantic's JSON parser stops at 200 by itself
 
-# `__pydantic_config__` of the dataclasses and typed dictionaries that describe a file; LENIENT: which may hold further
+# `__pydantic_config__` of the dataclasses and typed dictionaries that describe a file; LENIENT ones may have further
 # keys, such as derived values, or those of other programs.
 STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 LENIENT = ConfigDict(STRICT, extra="ignore")
@@ -76,7 +76,7 @@ def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
     try:
         shallow = _is_shallow(text)
         plain = json.dumps(yaml.load(text, Loader=yaml.CSafeLoader) if shallow else None)
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:  # a UserError also for impossible dates
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:  # ValueError: also an impossible date
         raise UserError(f"{name} is no plain YAML: {' '.join(str(error).split())[:200]}") from error
     if not shallow:
         raise UserError(f"{name} is nested deeper than {MAX_DEPTH} levels, or has aliases or numbers of 100 digits")
@@ -127,7 +127,7 @@ def resolved(value: Any, name: str) -> Any:
 def read_resolved(path: Path) -> Any:
     """Read the JSON file at `path` as a configuration, see `resolved`.
 
-    There is a UserError also if a key stands twice, or a text has a lone surrogate, which could not be written again.
+    Also raises a UserError if a key occurs twice, or a text has a lone surrogate, which could not be written again.
     """
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -137,7 +137,7 @@ def read_resolved(path: Path) -> Any:
 
     try:
         text = read_bounded(path, MAX_RESOLVED_BYTES)
-        value = json.loads(text, object_pairs_hook=unique, parse_constant=int)  # which NaN is not
+        value = json.loads(text, object_pairs_hook=unique, parse_constant=int)  # int("NaN") raises a ValueError
         json.dumps(value, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is damaged or of another kind: {str(error)[:200]}") from error
@@ -145,7 +145,7 @@ def read_resolved(path: Path) -> Any:
 
 
 def mappings(value: Any) -> Iterator[dict[Any, Any]]:
-    """Yield all mappings in a plain value, every one before those within it."""
+    """Yield all mappings in a plain value, outer ones first."""
     if isinstance(value, dict):
         yield value
     for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
@@ -153,7 +153,7 @@ def mappings(value: Any) -> Iterator[dict[Any, Any]]:
 
 
 def canonical(value: Any) -> Any:
-    """Return a plain value without the keys that are null, at every level, and with 10 for 10.0."""
+    """Return a plain value without keys whose value is null, at every level, and with integral floats as integers."""
     if isinstance(value, dict):
         return {name: canonical(item) for name, item in value.items() if item is not None}
     if isinstance(value, list):

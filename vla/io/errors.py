@@ -1,4 +1,4 @@
-"""The error of whatever a user can mend, and the suggestion for a misspelt name."""
+"""The error for everything that a user can fix, and the suggestion for a misspelt name."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from difflib import get_close_matches
 
 
 class UserError(ValueError):
-    """Something that the user can mend: a value, a file or the machine. Its text names the thing and the way out.
+    """Something that the user can fix: a value, a file or the machine. Its text names the thing and the way out.
 
     The entry point prints the text alone. Every other exception is a bug and keeps its traceback.
     """

@@ -34,8 +34,8 @@ def atomic_path(target: Path) -> Iterator[Path]:
     Raises:
         OSError: the draft cannot be written; the message names `target`.
     """
-    # Not the number of this process: in a container it is that of a killed one, or of another machine's. Libraries
-    # choose the format by the suffix.
+    # Not the id of this process: in containers, a killed process or one of another machine may have had the same.
+    # The suffix is kept, because libraries choose the format by it.
     draft = target.with_name(f".{secrets.token_hex(4)}.{target.name}")
     before = draft.with_name(f"{draft.name}.before")
     try:
@@ -73,7 +73,7 @@ def write_json(target: Path, content: object) -> None:
     """Write strict JSON atomically, creating its folder; see `atomic_path`."""
     with atomic_path(target) as draft:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with draft.open("w", encoding="utf-8") as file:  # piece by piece: as a text it would take eight times its size
+        with draft.open("w", encoding="utf-8") as file:  # streamed: as one string it would take eight times its size
             json.dump(content, file, indent=1, allow_nan=False, ensure_ascii=False)
             file.write("\n")
 
@@ -116,7 +116,7 @@ def locked(path: Path, busy: str) -> FileLock:
 
 @contextmanager
 def warn_on_error(target: Path) -> Iterator[None]:
-    """Reduce any error of writing `target` to a warning: it only presents results which are already saved."""
+    """Reduce any error of writing `target` to a warning: the file only presents results that are already saved."""
     try:
         yield
     except Exception as error:

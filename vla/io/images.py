@@ -1,4 +1,4 @@
-"""Images of cameras: files that anybody may have written, and one rule of resizing for policies and importers.
+"""Camera images: decoding of untrusted files, and one resizing rule for policies and importers.
 
 Shapes: N images, H by W pixels.
 """
@@ -78,7 +78,7 @@ def decode_image(content: bytes, size: tuple[int, int] | None = None) -> Array:
                 asked = f", not {wanted[0]} x {wanted[1]} of {', '.join(MODES)}"
                 raise UserError(f"the image is {height} x {width} pixels of {image.mode}{asked}")
             return np.array(image.convert("RGB"))
-    except UnidentifiedImageError as error:  # whose text has an address in memory
+    except UnidentifiedImageError as error:  # its text contains a memory address
         raise UserError(f"the image cannot be decoded: it is not {' or '.join(FORMATS)}") from error
     except UserError:
         raise

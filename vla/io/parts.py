@@ -1,4 +1,4 @@
-"""Images that are parts of a larger picture, as anybody cuts them out who has the picture and the state."""
+"""Images that are parts of a larger picture, and can be cut out of it wherever the picture and the state are known."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class Part:
     __pydantic_config__ = STRICT
 
     camera: Camera
-    window: Annotated[tuple[float, ...], MinLen(4), MaxLen(4)] = WHOLE  # of a part that moves: where its middle is 0, 0
-    point: Annotated[tuple[Name, ...], MaxLen(3)] = ()  # (3,) state components, a place [m]; none: it does not move
-    offset: Annotated[tuple[float, ...], MaxLen(3)] = ()  # (3,) from that place to the middle of the part [m]
-    # (12,) row by row: the place of the middle (x, y, z, 1) → (down, across, 1), as shares of the picture, times depth.
+    window: Annotated[tuple[float, ...], MinLen(4), MaxLen(4)] = WHOLE  # of a moving part: relative to its centre
+    point: Annotated[tuple[Name, ...], MaxLen(3)] = ()  # (3,) state components of a position [m]; empty: it is fixed
+    offset: Annotated[tuple[float, ...], MaxLen(3)] = ()  # (3,) from that position to the centre of the part [m]
+    # (12,) rows of a matrix: the centre's (x, y, z, 1) → depth times (down, across, 1), as shares of the picture.
     projection: Annotated[tuple[float, ...], MaxLen(12)] = ()
-    pixels: Annotated[int, Ge(1), Le(4096)] = 1  # a part that moves does so by this fraction of the picture
+    pixels: Annotated[int, Ge(1), Le(4096)] = 1  # a moving part moves in steps of 1 / pixels of the picture
 
     def at(self, place: Array) -> Array:
         """Return the window (4,), within the picture, with the point at `place` (3,) [m]."""
@@ -53,7 +53,7 @@ class Part:
         return np.concatenate([corner, corner + size])
 
     def whole(self, size: tuple[int, int]) -> tuple[int, int]:
-        """Return height and width [px] of the smallest picture that is as fine as the part in `size`."""
+        """Return height and width [px] of the smallest picture in which the part has at least `size` pixels."""
         top, left, bottom, right = self.window
         return max(self.pixels, ceil(size[0] / (bottom - top))), max(self.pixels, ceil(size[1] / (right - left)))
 
@@ -89,12 +89,12 @@ def cut(picture: Array, window: Sequence[float] | Array, size: tuple[int, int]) 
 def with_parts(
     images: Mapping[str, Array], state: Mapping[str, float], parts: Sequence[Part], size: tuple[int, int]
 ) -> Mapping[str, Array]:
-    """Add the images (size, 3) of the parts that are missing, cut out of the whole picture.
+    """Add the images, (*size, 3), of the parts that `images` lacks, cut out of the whole picture.
 
     Args:
         images: camera → (H, W, 3) uint8, and `PICTURE`.
         state: component → its value.
-        parts: where they are.
+        parts: the parts of the picture.
         size: height and width [px] of what is cut out.
     """
     missing = [part for part in parts if part.camera not in images]

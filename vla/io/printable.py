@@ -1,4 +1,4 @@
-"""Texts of others on a terminal, where control characters could move the cursor, set the title or hide lines."""
+"""Untrusted texts on a terminal, where control characters could move the cursor, set the title or hide lines."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def show(renderable: Any) -> None:
 def track(items: Iterable[Item], description: str, total: float | None = None) -> Iterable[Item]:
     """Show a progress bar of an iteration.
 
-    It is painted here: threads deadlock where an iteration that was given up is collected in one of them.
+    The bar is drawn in this thread: one of its own may deadlock if an abandoned iterator is garbage-collected in it.
     """
     from rich import progress
 

@@ -1,4 +1,4 @@
-"""How far a long work is: a bar on a terminal, and a line now and then in a file or a pipe."""
+"""Progress of long work: a bar on a terminal, and an occasional line in a file or a pipe."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EVERY = 60.0  # between two lines [s]
 class Bar(Progress):
     """A bar with a label before it and a note behind it.
 
-    Lines are logged where it is not painted before its end: in a job of a cluster, or under nohup.
+    Where the bar is only drawn at its end, in a job of a cluster or under nohup, lines are logged as well.
     """
 
     def __init__(self, label: str, total: int | None, done: int = 0, note: str = "") -> None:
@@ -30,7 +30,7 @@ class Bar(Progress):
         self.add_task(note, total=total, completed=done)
 
     def show(self, done: int, note: str = "") -> None:
-        """Show that so many are done."""
+        """Show that `done` items are completed, with a note."""
         (task,) = self.tasks
         self.update(task.id, completed=done, description=note)
         if time.monotonic() - self._said >= EVERY and not self.console.is_terminal:

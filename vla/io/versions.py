@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, distributions, version
 
 @cache  # reading all metadata takes a third of a second
 def installed_versions() -> dict[str, str]:
-    """Return name → version of vla, of packages made for it, and of what they require, as far as it is installed."""
+    """Return name → version of vla, of packages that require it, and of the requirements of these, if installed."""
     listed = set[str]()
     for each in distributions():
         names = {each.name, *(re.split(r"[^\w.-]", text)[0] for text in each.requires or ())}

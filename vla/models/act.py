@@ -62,7 +62,7 @@ class ACT(ContextModel):
     In training a latent variable encodes the style of a demonstration. Outside training it is 0, the mean of its prior.
 
     Args:
-        layers: of the encoder over the context, of the decoder, and of the CVAE's encoder.
+        layers: number of layers in each of the context encoder, the decoder and the CVAE encoder.
         heads: number of attention heads.
         latent: Z.
         kl_weight: weight of the KL divergence of the latent from its prior; 0 omits latent and CVAE encoder.

@@ -1,4 +1,4 @@
-"""Lightning's checkpoints, which resume the training that wrote them and serve nothing else."""
+"""Lightning's checkpoints, which serve only to resume the training that wrote them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vla.io.errors import UserError
 
 
 class Header(NamedTuple):
-    """A checkpoint without what a training computes with."""
+    """Metadata of a checkpoint."""
 
     config: dict[str, Any]  # of the training
     finished: bool  # the training was completed
@@ -22,7 +22,7 @@ class Header(NamedTuple):
 
 
 def read_header(path: Path) -> Header:
-    """Read a checkpoint without its tensors, which takes the same time for any size. Raises as `read_content`."""
+    """Read the metadata of a checkpoint, in a time that does not depend on its size. Raises as `read_content`."""
     content = read_content(path, weights=False)
     config, steps = resolved(content.get("config"), f"the configuration in {path}"), content.get("global_step")
     if not isinstance(config, dict) or not isinstance(steps, int):
@@ -31,10 +31,10 @@ def read_header(path: Path) -> Header:
 
 
 def read_content(path: Path, weights: bool = True) -> dict[str, Any]:
-    """Read a checkpoint as plain values and tensors, on the CPU; without `weights` no numbers of tensors.
+    """Read a checkpoint as plain values and tensors on the CPU; without `weights`, the data of tensors is not read.
 
     Raises:
-        UserError: there is no file, or it is damaged or something else.
+        UserError: there is no file, or it is damaged or no checkpoint.
         OSError: the file cannot be read.
     """
     if not path.is_file():
@@ -52,6 +52,6 @@ def read_content(path: Path, weights: bool = True) -> dict[str, Any]:
 
 
 def weights_of(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the state of the model in a checkpoint: the EMA weights, and what modules keep besides."""
+    """Return the state of the model in a checkpoint: the EMA weights, and buffers and extra state of its modules."""
     prefix = "model."
     return {key[len(prefix) :]: value for key, value in content["state_dict"].items() if key.startswith(prefix)}

@@ -1,6 +1,6 @@
-"""Real-time chunking: the plan of a flow model goes on from the one that is executed while it is computed.
+"""Real-time chunking: the plan of a flow model continues the one that is executed while it is computed.
 
-Guidance is that of K. Black, M. Galliker, S. Levine, arXiv 2506.07339; training with what is certain, arXiv 2512.05964.
+Guidance follows K. Black, M. Galliker, S. Levine, arXiv 2506.07339; training with a given prefix, arXiv 2512.05964.
 
 Shapes: B batch, k action chunk, D action components.
 """
@@ -23,11 +23,11 @@ Velocity = Callable[[Tensor, Tensor], Tensor]
 
 
 class Running(NamedTuple):
-    """The plans that are executed, from the times of the observations on."""
+    """The plans being executed, from the times of the observations on."""
 
-    actions: Tensor  # (B, k, D) as the model scales them, of which the first `remaining` count
+    actions: Tensor  # (B, k, D) scaled as in the model; only the first `remaining` count
     remaining: Tensor  # (B,) 0: there is no plan
-    delay: Tensor  # (B,) actions, at most `remaining`, that will be over when the next plan arrives
+    delay: Tensor  # (B,) number of actions, at most `remaining`, that are executed before the next plan arrives
 
 
 class Chunking(ABC):
@@ -35,19 +35,19 @@ class Chunking(ABC):
 
     @abstractmethod
     def continued(self, velocity: Velocity, running: Running) -> Velocity:
-        """Return the changed velocity; where no plan runs it is the old one."""
+        """Return the changed velocity; rows without a running plan keep the original one."""
 
 
 class Guided(Chunking):
     """Guidance towards the running plan, for policies that were not trained for it.
 
     At time t, with v the velocity, the estimated actions are A = a + (1 - t) v, and the velocity becomes
-    v + min(limit, (t² + (1 - t)²) / (t (1 - t))) (∂A/∂a)ᵀ W (running - A). W is 1 for actions that are over when the
-    plan arrives, and then decays to 0 where the running plan ends.
+    v + min(limit, (t² + (1 - t)²) / (t (1 - t))) (∂A/∂a)ᵀ W (running - A). W is 1 for actions that are executed before
+    the plan arrives, and then decays to 0 where the running plan ends.
 
     Args:
-        jacobian: with ∂A/∂a as published, by a pass back through the network, or the identity, as in LeRobot.
-        decay: of W: linear, c, or c (exp(c) - 1) / (e - 1).
+        jacobian: compute ∂A/∂a by backpropagation through the network, as published; else the identity, as in LeRobot.
+        decay: how W decays: "linear", c from 1 to 0, or "exponential", c (exp(c) - 1) / (e - 1).
         limit: largest factor of the guidance, β.
     """
 
@@ -74,7 +74,7 @@ class Guided(Chunking):
 
 
 class TrainedPrefix(Chunking):
-    """The network is given the actions that are over when the plan arrives, as in training."""
+    """The network is given the actions that are executed before the plan arrives, as in training."""
 
     def continued(self, velocity: Velocity, running: Running) -> Velocity:
         """Return the velocity given the prefix."""
@@ -90,8 +90,8 @@ def with_prefix(noisy: Tensor, time: Tensor, clean: Tensor, length: Tensor) -> t
 def after_prefix(perturbations: Tensor, length: Tensor) -> Tensor:
     """Return the loss mask (B, k) of chunks that begin with (B,) `length` executed actions.
 
-    Reactions to what was executed are predictable, however perturbed it was: a label counts unless a step between the
-    prefix and itself was perturbed. `perturbations` (B, k) counts those before each label, -1 beyond the episode.
+    Reactions to executed actions are predictable even if these were perturbed, so a label counts unless a step between
+    the prefix and the label was. `perturbations` (B, k): perturbed steps before each label, -1 beyond the episode.
     """
     place = torch.arange(perturbations.shape[1], device=length.device)
     before = perturbations.gather(1, length.unsqueeze(1))
@@ -121,7 +121,7 @@ def require_prefix(prefix: int, execute: int, chunk: int) -> None:
 
 
 def require_fit(method: type, model: Mapping[str, Any], delay: int) -> None:
-    """Raise a UserError if the chunks of a model, given by its node, are too short for a delay [actions]."""
+    """Raise a UserError if chunks or trained prefixes of a model, given by its node, are too short for a delay."""
     chunk = model["chunk"]
     interval = max(delay, model["execute"] or chunk)  # between one plan and the next
     if delay + interval > chunk:

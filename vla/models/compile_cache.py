@@ -1,4 +1,4 @@
-"""The cache of graphs that PyTorch compiles, one per instruction set."""
+"""PyTorch's cache of compiled graphs, one per instruction set."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ CACHE_VARIABLE = "TORCHINDUCTOR_CACHE_DIR"
 
 
 def set_compile_cache() -> None:
-    """Set PyTorch's cache folder of compiled graphs, unless it is set, to one per instruction set.
+    """Set PyTorch's cache folder of compiled graphs to one per instruction set, unless the user has set it.
 
-    A graph that was compiled for another instruction set silently computes other results or ends the process, and
-    PyTorch's cache key ignores the instruction set. PyTorch's own folder, which it sets itself, counts as none.
+    A graph compiled for another instruction set silently gives different results or crashes the process, and
+    PyTorch's cache key ignores the instruction set. PyTorch's default folder, which it sets itself, is replaced.
     """
-    from torch._inductor.runtime.cache_dir_utils import default_cache_dir  # heavy: only for who compiles
+    from torch._inductor.runtime.cache_dir_utils import default_cache_dir  # heavy, and needed only to compile
 
     shared = default_cache_dir()
     if os.environ.get(CACHE_VARIABLE, shared) == shared:

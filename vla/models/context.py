@@ -1,4 +1,4 @@
-"""Contexts: what the head of a model knows of a window of observations, as tokens.
+"""Contexts: a window of observations as tokens, which the head of a model attends to.
 
 Shapes: B batch, T frames, n tokens per frame, N tokens of the context, E width of a token, C features of a camera.
 """
@@ -26,7 +26,7 @@ class Encoded(NamedTuple):
     """The context of B windows."""
 
     tokens: Tensor  # (B, N, E)
-    summary: Tensor  # (B, E) one token of everything, which is also among `tokens` or made of them
+    summary: Tensor  # (B, E) one token that summarises the window, among `tokens` or computed from them
     padding: Tensor | None = None  # (B, N) bool, true for tokens of absent frames; None: there are none
     state: Tensor | None = None  # (B, R) normalised state of the robot, for heads that need it; None: it is not used
 
@@ -34,10 +34,10 @@ class Encoded(NamedTuple):
 class Context(nn.Module, ABC):
     """Cameras, robot state and instruction of a window → tokens that a head attends to.
 
-    A policy calls `encode` once per observation and keeps what it returns; `forward` makes the context once per plan,
-    and the head decodes as many steps as it likes after it. A pretrained trunk is a further subclass: it returns its
-    last hidden states and their padding, ignores `image`, reads the instruction as token ids from a text encoder whose
-    `forward` returns its argument, and is frozen or trained at a rate of its own under its name, `context`.
+    A policy calls `encode` once per observation and caches the result; `forward` computes the context once per plan,
+    and the head then decodes any number of steps. A pretrained trunk can be added as a subclass: it returns its last
+    hidden states and their padding, ignores `image`, reads the instruction as token ids from a text encoder whose
+    `forward` returns its argument, and is frozen, or trained at its own learning rate, under the name `context`.
 
     Args:
         image: factory of image encoders, called with `text_width`.
@@ -58,24 +58,24 @@ class Context(nn.Module, ABC):
     def encode(self, batch: Batch, text: Tensor) -> Tensor | None:
         """Return tokens of each frame, (B, T, n, E), that depend on the frame and the instruction alone.
 
-        They take the place of images and states in the batch of `forward`, as "tokens". None: there is nothing to keep.
+        They take the place of images and states in the batch of `forward`, as "tokens". None: nothing can be cached.
 
         Args:
-            batch: as of a model, without "text".
+            batch: as in `Model`; "text" is not used.
             text: (B, text_width) instruction.
         """
         return None
 
     @abstractmethod
     def forward(self, batch: Batch, text: Tensor) -> Encoded:
-        """Return the context at the newest present frame; later padding has no effect. Arguments as of `encode`."""
+        """Return the context at the newest present frame; later padding has no effect. Arguments as in `encode`."""
 
 
 class KeypointFeatures(nn.Module):
-    """Keypoints of every camera, each with an image encoder of its own, and the robot state, of the newest frame.
+    """Keypoints of every camera, each with its own image encoder, and the robot state, of the newest frame.
 
     Args:
-        keypoints: per camera.
+        keypoints: number of keypoints per camera.
         proprioception: use the robot state.
         make_encoder: returns an image encoder.
         spec: observation and action spaces.
@@ -117,10 +117,10 @@ class Proprioception(nn.Module):
 
 
 class KeypointContext(Context):
-    """A token per camera, of its keypoints, one of the robot state, one of the instruction, and first one of them all.
+    """One token that fuses all features, one per camera for its keypoints, one for the robot state, one for the text.
 
     Args:
-        keypoints: per camera.
+        keypoints: number of keypoints per camera.
         proprioception: use the robot state.
     """
 
@@ -142,17 +142,17 @@ class KeypointContext(Context):
 
 
 class TokenContext(Context):
-    """n tokens per frame: those of TokenLearner and one of keypoints for every camera, and one of the robot state.
+    """n tokens per frame: for every camera those of TokenLearner and one of keypoints, and one for the robot state.
 
-    After the frames come the instruction and an MLP of the newest frame and the instruction. Without that last token,
-    with attention alone, training takes several times as long.
+    The frames are followed by a token of the instruction and one that an MLP computes from the newest frame and the
+    instruction. Without the latter, with attention alone, training takes several times as long.
 
     Args:
         history: T.
         learned_tokens: tokens per camera and frame.
         keypoints: number of keypoints in an additional token per camera; 0 omits the token.
         proprioception: add a token of the robot state.
-        frames_alone: omit what comes after the frames; the summary is then the mean of the newest frame.
+        frames_alone: omit `Fusion`, and so both of these tokens; the summary is then the mean of the newest frame.
     """
 
     def __init__(

@@ -62,9 +62,9 @@ def _attend(
 class Decoder(ContextModel):
     """`nn.TransformerDecoder` over action tokens, with causal self-attention and cross-attention to the context.
 
-    The start token is the summary of the context. Training is on the newest frame of a window, with teacher forcing, or
-    with inputs drawn near the labels if the tokenizer has some (`sampled`). Decoding is greedy: each most likely token
-    is fed back, and the tokenizer turns the logits into an action.
+    The start token is the summary of the context. The decoder is trained on the newest frame of a window with teacher
+    forcing, where some tokenizers draw the inputs near the labels (`sampled`). Decoding is greedy: the most likely
+    token is fed back each time, and the tokenizer turns the logits and tokens into actions.
 
     Args:
         layers, heads, feedforward: of the decoder; feedforward is the hidden width of its MLPs.
@@ -97,7 +97,7 @@ class Decoder(ContextModel):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return logits: (B, L, K) and tokens: (B, L), the labels of the newest frame.
 
-        With an auxiliary head also truth: (B, 1, S), normalised. With (B, T, N, E) "tokens" from `encode` no images.
+        With an auxiliary head also truth: (B, 1, S), normalised. With (B, T, N, E) "tokens", images are not needed.
         """
         tokens = self.tokenizer.tokenize(batch["action"][:, -1])
         inputs = self.tokenizer.sampled(tokens, batch["action"][:, -1]) if self.training else tokens

@@ -24,7 +24,7 @@ MAX_FREQUENCY, MIN_FREQUENCY = 100.0, 1.0  # of the time embedding [rad]; time r
 
 
 class Denoiser(nn.Module):
-    """A transformer from a noisy chunk and its context to a vector for every action.
+    """A transformer that maps a noisy chunk and its context to one vector per action.
 
     Self-attention is causal, so that padding after the last valid action has no effect.
 

@@ -25,11 +25,11 @@ class Flow(DenoisingModel):
     the context, later mostly on the noisy actions themselves.
 
     Args:
-        prefix: largest number of actions at the start of a chunk that training gives, at time 1, as they were executed,
-            to predict the others; for `vla.models.chunking.TrainedPrefix`.
+        prefix: largest number of executed actions that training gives, without noise (time 1), at the start of a chunk
+            to predict the rest; for `vla.models.chunking.TrainedPrefix`.
 
     Raises:
-        UserError: `prefix` leaves fewer actions than are executed.
+        UserError: `prefix` leaves fewer than `execute` actions of a chunk.
     """
 
     continues = True

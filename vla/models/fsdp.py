@@ -1,6 +1,6 @@
 """Fully sharded data parallel training (FSDP2).
 
-Every function accepts models and tensors that are not sharded, and leaves them unchanged.
+Every function but `shard` accepts models and tensors that are not sharded, and leaves them unchanged.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def shard(model: nn.Module, mesh: DeviceMesh) -> None:
 
     for weight in model.parameters():
         weight.data = weight.data.contiguous()  # channels-last filters cannot be sharded
-    for part in reversed([*model.modules()]):  # inner blocks first, as `fully_shard` wants it
+    for part in reversed([*model.modules()]):  # inner blocks first, as `fully_shard` requires
         for block in part if isinstance(part, nn.ModuleList) else ():
             if sum(weight.numel() for weight in block.parameters()) >= MIN_PARAMETERS:
                 fully_shard(block, mesh=mesh)

@@ -15,9 +15,9 @@ def fetch(name: str, *patterns: str, advice: str = "") -> Path:
     """Return a folder with the files of a model that match the patterns, downloading those that are not cached.
 
     Args:
-        name: OWNER/NAME, or OWNER/NAME@REVISION, a branch, a tag or a commit; "hub:" may stand before it.
-        patterns: of the names of the files.
-        advice: what to do if it fails.
+        name: OWNER/NAME or OWNER/NAME@REVISION, optionally after "hub:"; a revision is a branch, a tag or a commit.
+        patterns: wildcard patterns of file names.
+        advice: what the user can do if it fails, for the error message.
 
     Raises:
         UserError: there is no such model, or the hub is unreachable and the model is not cached.
@@ -40,13 +40,13 @@ def fetch(name: str, *patterns: str, advice: str = "") -> Path:
 
 
 def _unreachable() -> str | None:
-    """Return why the hub is unreachable, or None; without this check a download waits without a limit of its own."""
+    """Return why the hub is unreachable, or None; without this check a download would wait without a timeout."""
     from huggingface_hub import constants, get_session
 
     if constants.HF_HUB_OFFLINE:
         return "HF_HUB_OFFLINE is set"
     try:
         get_session().head(constants.ENDPOINT, timeout=TIMEOUT)  # any status will do
-    except Exception as error:  # of several kinds, also of an HF_ENDPOINT that is no address
+    except Exception as error:  # of many types, also for an HF_ENDPOINT that is no address
         return lines_of(error)[0]
     return None

@@ -10,7 +10,7 @@ from vla.spec import Spec
 
 
 class RobotState(nn.Module):
-    """The state of a batch without rates, and the pose of the tool if the kinematics are known.
+    """The robot state without rates of change, and with the pose of the tool if the kinematics are known.
 
     Velocities are left out because a policy that observes them learns that an arm at rest stays at rest.
 
@@ -44,8 +44,8 @@ class ForwardKinematics(nn.Module):
     A network that learned it from the joint angles of a hundred demonstrations was off by centimetres.
 
     Args:
-        chain: (J + 1, 7) pose of the frame of each joint, and last of the tool, in the frame before: offset [m] and
-            quaternion wxyz. Joints rotate about their z axis.
+        chain: (J + 1, 7) poses of the joint frames and, last, of the tool frame, each in the frame before it: offset
+            [m] and quaternion wxyz. Joints rotate about their z axis.
     """
 
     fixed: Tensor  # (J, 4, 4), the transform of a joint is this + cos·cosine + sin·sine
@@ -56,7 +56,7 @@ class ForwardKinematics(nn.Module):
     def __init__(self, chain: tuple[tuple[float, ...], ...]) -> None:
         super().__init__()
         rows = torch.tensor(chain, dtype=torch.float64)
-        # Not torch.eye, which imports PyTorch's compiler where the tensors of a checkpoint's model are counted.
+        # Not torch.eye, which would import PyTorch's compiler within a `TensorBudget`.
         links = torch.zeros(len(rows), 4, 4, dtype=torch.float64)
         links[:, :3, :3], links[:, :3, 3], links[:, 3, 3] = _rotation(rows[:, 3:]), rows[:, :3], 1
         fixed, cosine, sine = (torch.zeros(len(rows) - 1, 4, 4, dtype=torch.float64) for _ in range(3))

@@ -18,7 +18,7 @@ Batch = dict[str, Any]
 class RunningNormalizer(nn.Module):
     """Normalisation to zero mean and unit variance by running statistics, which are saved with the weights.
 
-    Unlike batch normalisation it never uses the current batch alone; statistics are of all processes of a training.
+    Unlike those of batch normalisation, the statistics are of all batches so far, in all processes of a training.
 
     Args:
         width: number of components.
@@ -70,14 +70,14 @@ def _sum_over_processes(tensor: Tensor) -> Tensor:
 
 
 def mean_where(values: Tensor, mask: Tensor) -> Tensor:
-    """Return the mean of values where the bool mask of the same shape is true; 0 if it is so nowhere."""
+    """Return the mean of values where the bool mask of the same shape is true; 0 if it is all false."""
     return (values * mask).sum() / mask.sum().clamp(min=1)
 
 
 def exact_product(left: Tensor, right: Tensor) -> Tensor:
-    """Return the product of small matrices, (…, N, K) and (…, K, M), in float32 also where others are rounded.
+    """Return the product of small matrices, (…, N, K) and (…, K, M), in full float32 precision.
 
-    Autocast rounds factors to bfloat16, and training on a GPU to TensorFloat-32, which has 10 bits.
+    Autocast would round the factors to bfloat16, and training on a GPU to TensorFloat-32, with a 10-bit mantissa.
     """
     if left.is_cuda:
         return (left.unsqueeze(-1) * right.unsqueeze(-3)).sum(-2)
@@ -86,9 +86,9 @@ def exact_product(left: Tensor, right: Tensor) -> Tensor:
 
 
 def random_arguments(training: bool, device: torch.device) -> dict[str, Any]:
-    """Return arguments for torch's functions of random numbers: outside training they are the same on every device.
+    """Return arguments for torch's random functions, which outside training give the same numbers on every device.
 
-    In training they are made on the device: it would have to finish its work before it gets a copy.
+    In training, numbers are drawn on the device: a copy from the CPU would wait until the device finishes its work.
     """
     return {"device": device} if training else {"generator": torch.Generator().manual_seed(0)}
 

@@ -41,10 +41,10 @@ class Learner(LightningModule):
         compile: compile the model with torch.compile.
         ema: decay per step of the EMA weights, which are the ones evaluated and saved; 0 disables EMA.
         rates: part of the model, such as context or context.image, → factor of its learning rate.
-        frozen: parts that are not trained, but for factors of LoRA in them: neither weights nor what they count and
-            average, such as the statistics of batch normalisation.
-        lora: linear maps that learn by low-rank factors; None: none.
-        checkpointing: compute activations within layers again for the gradients, instead of keeping them.
+        frozen: parts that are not trained, except for LoRA factors in them: neither their weights nor their running
+            statistics, such as those of batch normalisation, change.
+        lora: low-rank adaptation of linear maps; None: there is none.
+        checkpointing: recompute activations within layers in the backward pass instead of keeping them.
         model: the model to train.
         spec: observation and action spaces; saved with every checkpoint.
         config: the resolved configuration as plain dicts and lists; saved with every checkpoint.
@@ -82,7 +82,7 @@ class Learner(LightningModule):
             lora.inject(model)
         if checkpointing:
             recompute_layers(model)
-        self._groups()  # names of unknown parts are refused now, and frozen ones are frozen before they are distributed
+        self._groups()  # refuses unknown names early, and freezes parts before the model is sharded
         self._trunks, self._figures = trunks(model), dict[str, float]()
         modules = dict(model.named_modules())
         for name in modules.keys() & {*self._trunks, *frozen}:  # what is frozen may also be a single parameter
@@ -92,7 +92,7 @@ class Learner(LightningModule):
         return self.model.parameter_groups(self._lr, self._weight_decay, self._rates, self._frozen)
 
     def configure_model(self) -> None:
-        """Compile the model in place, so that names in checkpoints stay; shard it if the strategy has a device mesh."""
+        """Compile the model in place, which keeps names in checkpoints; shard it if the strategy has a device mesh."""
         if self._compile:
             set_compile_cache()
             self.model.compile()
@@ -109,23 +109,23 @@ class Learner(LightningModule):
             torch.set_float32_matmul_precision("high")
 
     def teardown(self, stage: str) -> None:
-        """Undo what `on_fit_start` set: an evaluation in this process gives what one in another process gives."""
+        """Undo what `on_fit_start` set, so that an evaluation in this process gives the same results as in another."""
         if self._before is not None:
             _set_precision(*self._before)
             self._before = None
 
     def configure_callbacks(self) -> list[Callback]:
-        """Return the callback that undoes it after an error, too: Lightning does not then, and a sweep goes on."""
+        """Return a callback that calls `teardown` after an error, when Lightning does not but a sweep continues."""
         return [LambdaCallback(on_exception=lambda *_: self.teardown("fit"))]
 
     @contextmanager
     def evaluating(self) -> Iterator[None]:
-        """Compute within the context what another process would, which does not train: see `on_fit_start`."""
+        """Within the context, compute exactly what a process that does not train would: see `on_fit_start`."""
         during = torch.backends.cuda.flash_sdp_enabled(), torch.get_float32_matmul_precision()
         if self._before is not None:
             _set_precision(*self._before)
         try:
-            with torch.compiler.set_stance("force_eager"):  # a window's shape is not the compiled one
+            with torch.compiler.set_stance("force_eager"):  # compiled for another shape than that of one window
                 yield
         finally:
             _set_precision(*during)
@@ -156,7 +156,7 @@ class Learner(LightningModule):
             return (step + 1) / (self._warmup + 1)
         if self._schedule == "constant":
             return 1.0
-        total = float(self.trainer.estimated_stepping_batches)  # infinite without a number of steps
+        total = float(self.trainer.estimated_stepping_batches)  # infinite without a limit of steps
         done = (step - self._warmup) / max(total - self._warmup, 1)
         return 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
 
@@ -165,7 +165,7 @@ class Learner(LightningModule):
         return self.model.transforms(batch)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Return the loss of a batch, augmented here, after `StepSeeding` and outside the compiled part.
+        """Return the loss of a batch, which is augmented here: after `StepSeeding` and outside the compiled part.
 
         Raises:
             UserError: the loss of this step or an earlier one is not finite.
@@ -187,7 +187,7 @@ class Learner(LightningModule):
 
     def _require_finite(self) -> None:
         if self._non_finite_step is not None and distributed.is_available() and distributed.is_initialized():
-            # Else one process would end, and the others wait for it.
+            # Otherwise one process would stop while the others wait for it.
             distributed.all_reduce(self._non_finite_step, op=distributed.ReduceOp.MIN)
         if self._non_finite_step is not None and (step := int(self._non_finite_step)) != NEVER:
             raise UserError(
@@ -218,7 +218,7 @@ class Learner(LightningModule):
             self.log(f"val/error_{name}{f'_{unit_name}' if unit_name else ''}", metric)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add config, spec and the figures of the last validation as plain dicts, which load without running code.
+        """Add config, spec, trunks, LoRA's scale and the last validation's figures, which load without running code.
 
         Raises:
             UserError: a loss was not finite.

@@ -1,4 +1,4 @@
-"""LoRA: what a linear map learns is a product of two small matrices (E. Hu et al., arXiv 2106.09685).
+"""LoRA: linear maps learn an update that is a product of two small matrices (E. Hu et al., arXiv 2106.09685).
 
 Shapes: r rank, I inputs and O outputs of a linear map.
 """
@@ -16,19 +16,19 @@ from vla.io.errors import UserError
 from vla.io.types import Count, Names, Positive, Rate
 from vla.models.trunk import is_factor, is_within
 
-ADAPTER = "default"  # peft's name of the only one
+ADAPTER = "default"  # peft's name for the only adapter
 
 
 @dataclass(frozen=True)
 class LoRA:
-    """Linear maps whose (O, I) weight W is frozen, and becomes W + alpha / r · B A with trained B (O, r) and A (r, I).
+    """Frozen (O, I) weights W of linear maps become W + alpha / r · B A, where B (O, r) and A (r, I) are trained.
 
     Args:
-        modules: their dotted names, or those of parts with such maps; `*` stands for anything, and the beginning can be
-            left out: `q_proj`, `context`, `expert.*.v_proj`.
+        modules: dotted names of linear maps, or of parts that contain some; `*` matches anything, and the beginning of
+            a name can be left out: `q_proj`, `context`, `expert.*.v_proj`.
         rank: r.
-        alpha: factor of the product, times r.
-        dropout: of the inputs of A.
+        alpha: scale of the product times r.
+        dropout: rate of dropout of the inputs of A.
     """
 
     modules: Names
@@ -38,14 +38,14 @@ class LoRA:
 
     @property
     def scale(self) -> float:
-        """Return the factor of the product of the factors."""
+        """Return the scale of the product, alpha / r."""
         return self.alpha / self.rank
 
     def inject(self, model: nn.Module) -> None:
-        """Put the factors into a model, in place; what else it trains stays trained.
+        """Add the factors to a model, in place; its other trained parameters stay trained.
 
         Raises:
-            UserError: a name is that of no linear map, or peft is not installed.
+            UserError: a name matches no linear map, or peft is not installed.
         """
         try:
             from peft import LoraConfig, inject_adapter_in_model
@@ -59,11 +59,11 @@ class LoRA:
             weight.requires_grad_(is_factor(name) or (id(weight) in trained and ".base_layer." not in name))
         for module in model.modules():
             if isinstance(module, nn.TransformerEncoderLayer) and any(map(is_factor, module.state_dict())):
-                module.activation_relu_or_gelu = 0  # else it would read the weights past the factors, in evaluation
+                module.activation_relu_or_gelu = 0  # else the fast path of evaluation would ignore the factors
 
     def _chosen(self, model: nn.Module) -> list[str]:
         modules, chosen = dict(model.named_modules()), dict[str, None]()
-        # Those of torch's attention are not called as modules, so factors beside them would do nothing.
+        # The linear maps in torch's attention are not called as modules, so factors in them would have no effect.
         attention = [name for name, module in modules.items() if isinstance(module, nn.MultiheadAttention)]
         linear = [name for name in modules if isinstance(modules[name], nn.Linear) and not is_within(name, attention)]
         for pattern in self.modules:
@@ -80,9 +80,9 @@ class LoRA:
 
 
 def without_lora(state: Mapping[str, Any], scale: float, named: Collection[str]) -> dict[str, Any]:
-    """Return the state of a model as if there were no LoRA, and without the trunks `named`.
+    """Return the state of a model with its LoRA factors merged into the weights, and without the trunks `named`.
 
-    Weights get the product of their factors added. In a trunk the factors remain, as lora_A and the scaled lora_B.
+    The factors in a trunk are not merged: they remain, as lora_A and the scaled lora_B.
     """
     plain = dict[str, Any]()
     for name, value in state.items():

@@ -37,13 +37,13 @@ class Prediction(NamedTuple):
 class Model(nn.Module, ABC):
     """A policy network: batch of windows → actions.
 
-    A batch is a dict, which `transforms` has made of observations:
+    A batch is a dict that `transforms` has made of observations:
         rgb: camera → (B, T, H, W, 3) uint8 of `image_size`; state: (B, T, P) float32; present: (B, T) bool, false for
         padding; text: from `text.tokenize`. For training also action: (B, T, k, D) float32; valid: (B, T, k) bool, the
-        loss mask, true for a prefix of each chunk; executed: what the robot did, as action; perturbations: (B, T, k)
-        int, perturbed steps before each label, -1 beyond the episode; truth: (B, T, S) float32. For generative models
-        optionally noise: (B, k, D) float32, standard normal; for plans that continue others running: (B, k, D)
-        float32, remaining and delay: (B,), see `chunking.Running`.
+        loss mask, true for a prefix of each chunk; executed: the executed actions, in the shape of action;
+        perturbations: (B, T, k) int, perturbed steps before each label, -1 beyond the episode; truth: (B, T, S)
+        float32. For generative models optionally noise: (B, k, D) float32, standard normal; for plans that continue
+        running ones also running: (B, k, D) float32, and remaining and delay: (B,), see `chunking.Running`.
 
     A policy executes the first `execute` of the k actions before it predicts again.
 
@@ -68,7 +68,7 @@ class Model(nn.Module, ABC):
     history = 1  # T, number of frames in the input
     continues = False  # whether its plans can continue running ones, by a `chunking` that the policy sets
     chunking: Chunking | None = None
-    prefix = 0  # longest start of a chunk that was given in training
+    prefix = 0  # largest number of actions that training gives at the start of a chunk
     uses_tokens = True  # whether actions are predicted as tokens; else as numbers, scaled by the tokenizer's bounds
 
     def __init__(
@@ -100,7 +100,7 @@ class Model(nn.Module, ABC):
         self.add_truth_head(width, auxiliary)
 
     def require_vector(self) -> None:
-        """Raise a UserError unless the text encoder makes a vector of a sentence."""
+        """Raise a UserError unless the text encoder maps a sentence to a vector."""
         if not self.text.vectors:
             raise UserError(
                 f"{type(self).__name__} needs a vector of the sentence, and {type(self.text).__name__} makes tokens: "
@@ -116,7 +116,7 @@ class Model(nn.Module, ABC):
             self.truth_scale = RunningNormalizer(self.spec.truth_size)
 
     def fit(self, states: np.ndarray, actions: np.ndarray) -> None:
-        """Fit what the model keeps of the demonstrations, (N, P) states and (N, D) actions of all steps: nothing."""
+        """Fit the model's own normalisation, if any, to (N, P) states and (N, D) actions of all steps."""
 
     def augment(self, batch: Batch) -> Batch:
         """Return a training batch with randomly shifted images; this part is not compiled."""
@@ -157,9 +157,9 @@ class Model(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the inputs of `action_loss` for the last T' of the T frames; this part is compiled.
+        """Return the inputs of `action_loss` for the last T' of the T frames, and the result of `predict_truth`.
 
-        Also the result of `predict_truth`.
+        This part is compiled.
         """
 
     @abstractmethod
@@ -191,18 +191,18 @@ class Model(nn.Module, ABC):
     def parameter_groups(
         self, learning_rate: float, weight_decay: float, rates: Mapping[str, float], frozen: Collection[str]
     ) -> list[dict[str, Any]]:
-        """Return groups of trained parameters for AdamW; matrices and filters decay, but no embeddings.
+        """Return groups of trained parameters for AdamW; weight decay applies to matrices and filters, not embeddings.
 
-        A network of timm tells which parameters are embeddings, such as those of positions.
+        Networks of timm say in `no_weight_decay` which parameters are embeddings, such as those of positions.
 
         Args:
             learning_rate: of parts that `rates` does not name.
-            weight_decay: of what decays.
+            weight_decay: of matrices and filters.
             rates: part, such as "context" or "context.image", → factor of its learning rate; the longest name counts.
-            frozen: parts that are not trained, but for factors of LoRA.
+            frozen: parts that are not trained, except for LoRA factors in them.
 
         Raises:
-            UserError: a name is that of no part, or nothing is left to train.
+            UserError: a name matches no part, or nothing is left to train.
         """
         parameters = dict(self.named_parameters())
         _require_parts(parameters, "rates", rates)
@@ -247,10 +247,10 @@ def _embeddings(model: nn.Module) -> set[int]:
 
 
 class ContextModel(Model):
-    """A model that is the head of a context.
+    """A model that predicts actions from a `Context`.
 
     Args:
-        context: factory of the context, called with what `Context` needs.
+        context: factory of the context, called with the arguments of `Context`.
         image: factory of the image encoders of the context.
     """
 

@@ -32,7 +32,7 @@ class PackagedFile:
         """Return the path of the file, or the folder of the model on the hub with the files that match patterns.
 
         Raises:
-            UserError: the package is not installed and the hub is not available, or the package has another file.
+            UserError: the package is not installed and the hub is not available, or the package lacks this file.
         """
         try:
             package = distribution(self.source)

@@ -1,7 +1,7 @@
 """A trained policy as a folder of plain data: JSON, safetensors, and a card that a person reads.
 
-config.json has the resolved nodes of the training, spec.json its spaces, model.safetensors what was trained (the EMA
-weights, under the names of the modules), and training.json how that was done. Nothing in the folder is code.
+config.json has the resolved config nodes of the training, spec.json its spaces, model.safetensors the EMA weights
+except those of trunks, under the names of the modules, and training.json how they were made. None of it is code.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from vla.spec import Spec
 
 POLICY, BEST = "policy", "policy_best"  # in the folder of a run: its policy, and the best one in validation
 CONFIG, SPEC, WEIGHTS, TRAINING, CARD = "config.json", "spec.json", "model.safetensors", "training.json", "README.md"
-FURTHER = "state"  # of modules that is no tensor, as JSON, in the metadata of the weights
+FURTHER = "state"  # key in the metadata of the weights: state of modules that is no tensor, as JSON
 REQUIRED_NODES = ("task", "tokenizer", "model")  # of the config
 OPTIONAL_NODES = ("policy", "chosen", "expert", "collect", "data", "learner", "trainer", "validate")
 TRUTH_MODULES = ("truth_head", "truth_scale")  # modules of a model used in training only
@@ -48,16 +48,16 @@ class Training:
     steps: Natural  # of the optimiser
     windows: str  # digest of the demonstrations, empty if unknown
     seed: int | None
-    validation: tuple[Seed, Natural] | None  # first seed and number of the episodes that select among weights
+    validation: tuple[Seed, Natural] | None  # first seed and number of the episodes that selected the weights
     weights: SHA256  # of their file
     versions: dict[str, str]  # library → version
     figures: dict[str, float]  # of the last validation
-    trunks: dict[str, Source] = field(default_factory=dict)  # part → where its weights are, which the file lacks
+    trunks: dict[str, Source] = field(default_factory=dict)  # part → origin of its weights, which the file lacks
 
 
 @dataclass(frozen=True)
 class SavedPolicy:
-    """A policy in a folder; its weights are read when they are asked for."""
+    """A policy in a folder; its weights are read at the first access."""
 
     folder: Path
     config: dict[str, Any]  # of the training
@@ -69,7 +69,7 @@ class SavedPolicy:
         """Name → weights of the model, on the CPU, and the further state of its modules.
 
         Raises:
-            UserError: the file is damaged, or another than that of this training.
+            UserError: the file is damaged, or not the one that `TRAINING` describes.
         """
         path = _file(self.folder, WEIGHTS)
         with path.open("rb") as file:
@@ -81,7 +81,7 @@ class SavedPolicy:
             return further | {name: weights.get_tensor(name) for name in names}
 
     def initialize(self, model: Model) -> None:
-        """Load the weights for fine-tuning, as `restore`; the truth head keeps its own if the truth differs."""
+        """Load the weights for fine-tuning, see `restore`; if the truth differs, the truth head of `model` is kept."""
         state = self.state
         if self.spec.truth != model.spec.truth:
             state = {name: value for name, value in state.items() if name.partition(".")[0] not in TRUTH_MODULES}
@@ -94,10 +94,10 @@ class SavedPolicy:
         """Load the weights, or another `state`, into `model`.
 
         Raises:
-            UserError: they belong to another model, or a trunk of it is not here.
+            UserError: they belong to another model, or one of its trunks is not available.
         """
         state = self.state if state is None else state
-        own = {*state}  # and not the weights of a trunk, which lie elsewhere
+        own = {*state}  # without the weights of trunks, which are stored elsewhere
         require_trunks(model, self.training.trunks, self.folder)
         try:
             state = whole_state(model, state, self.training.trunks)
@@ -108,12 +108,12 @@ class SavedPolicy:
                     raise UserError(f"{name} has numbers of {state[name].dtype}, not {value.dtype}")
                 if name in own and value.is_floating_point() and not value.isfinite().all():
                     raise UserError(f"{name} has numbers that are not finite")
-        except Exception as error:  # whatever modules raise for a state that is not theirs
+        except Exception as error:  # modules may raise anything for a state that does not fit
             first = lines_of(error)[-1].strip()[:200]
             raise UserError(f"{self.folder} does not fit the model of its own configuration: {first}") from error
 
     def budget(self) -> TensorBudget:
-        """Return the context in which a model is built that its file can fill, and the trunks that it names.
+        """Return a context that limits a model built in it to what the weights file and the named trunks can fill.
 
         Raises:
             UserError: the trunks are larger than the memory.
@@ -130,7 +130,7 @@ def policy_folder(name: str | Path) -> Path:
     """Return the folder of a policy.
 
     Args:
-        name: the folder, or that of a run, whose policy is meant, or hub:owner/name@revision.
+        name: the folder of a policy, the folder of a run that has one, or hub:owner/name@revision.
 
     Raises:
         UserError: there is none.
@@ -152,7 +152,7 @@ def policy_folder(name: str | Path) -> Path:
 
 @cache
 def _fetched(name: str) -> Path:
-    """Return the folder of a policy on the hub, downloading what is not cached: a revision is looked up once."""
+    """Return the folder of a policy on the hub, downloading what is not cached; each name is looked up only once."""
     if REPOSITORY.fullmatch(name) is None:
         raise UserError(
             f"{name} is no policy on the hub: write {HUB}OWNER/NAME@REVISION, a tag, a branch or a commit; one of "
@@ -162,13 +162,13 @@ def _fetched(name: str) -> Path:
 
 
 def read_policy(name: str | Path) -> SavedPolicy:
-    """Read a policy but for its weights, as data: no code in it runs, and it holds resolved plain values.
+    """Read a policy, except for its weights, as data: no code in it runs, and it holds plain, resolved values.
 
     Args:
-        name: as of `policy_folder`.
+        name: see `policy_folder`.
 
     Raises:
-        UserError: there is none, or a file is missing, damaged, or none of this project.
+        UserError: there is none, or a file is missing, damaged, or not of this project.
         OSError: a file cannot be read.
     """
     folder = policy_folder(name)
@@ -178,7 +178,7 @@ def read_policy(name: str | Path) -> SavedPolicy:
     if not nodes.keys() >= {*REQUIRED_NODES} or not all(isinstance(node, dict) for node in present):
         raise UserError(f"{folder / CONFIG} is of no policy of this project: it lacks {', '.join(REQUIRED_NODES)}")
     with opened(_file(folder, WEIGHTS)):
-        pass  # its header has the sizes of all weights, which are those of the file
+        pass  # safetensors checks that the sizes of weights in the header match that of the file
     made = parse_plain(training, Training, str(folder / TRAINING))
     return SavedPolicy(folder, nodes, Spec.from_dict(spec, str(folder / SPEC)), made)
 
@@ -187,7 +187,7 @@ def _file(folder: Path, name: str) -> Path:
     """Return a file of a folder.
 
     Raises:
-        UserError: there is none, or it is a link out of the folder; those of the hub's cache lead to its blobs.
+        UserError: there is none, or it is a link out of the folder; in the hub's cache, links may lead to its blobs.
     """
     path, root = folder / name, folder.resolve()
     blobs = root.parents[1] / "blobs" if root.parent.name == "snapshots" else root
@@ -199,7 +199,7 @@ def _file(folder: Path, name: str) -> Path:
 
 
 def require_unseen(name: str | Path, key: str, seeds: range) -> None:
-    """Raise a UserError if a policy is to be evaluated on `seeds`, set by the dotted `key`, that selected it."""
+    """Raise a UserError if `seeds`, set by the dotted `key`, include episodes that selected the weights of a policy."""
     first, count = read_policy(name).training.validation or (0, 0)
     if shared := range(max(first, seeds.start), min(first + count, seeds.stop)):
         raise UserError(
@@ -209,10 +209,10 @@ def require_unseen(name: str | Path, key: str, seeds: range) -> None:
 
 
 class TensorBudget(TorchFunctionMode):
-    """Context that limits the total size of created tensors to what weights of `size` [bytes] in a `folder` could fill.
+    """Context that limits the total size of created tensors to about twice `size` [bytes], the weights in a `folder`.
 
-    A config that requires more is refused at the first tensor above the limit, before it is allocated. A model built on
-    the device "meta" would tell the same, but its initialisation there imports PyTorch's compiler, which takes seconds.
+    A config that requires more is refused at the first tensor above the limit, before it is allocated. Building the
+    model on the device "meta" would show its size, too, but importing PyTorch's compiler for that takes seconds.
     """
 
     def __init__(self, folder: Path, size: int) -> None:
@@ -222,7 +222,7 @@ class TensorBudget(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Call `func` after subtracting the size of its result from the budget; a UserError if it is exceeded."""
         kwargs = kwargs or {}
-        on_meta = str(kwargs.get("device")) == "meta"  # which takes no memory: what others fill, such as transformers
+        on_meta = str(kwargs.get("device")) == "meta"  # takes no memory until a library such as transformers fills it
         if func in FACTORIES and not on_meta:
             described = {name: value for name, value in kwargs.items() if name not in ("generator", "out")}
             try:

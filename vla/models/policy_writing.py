@@ -1,4 +1,4 @@
-"""Writing of a trained policy as a folder, see `vla.models.policy_folder`."""
+"""Writes a trained policy as a folder, see `vla.models.policy_folder`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ and in a program it is `vla.api.load_policy(FOLDER)`.
 
 
 def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write what Lightning saves of a training as a policy, which replaces the one in `folder`.
+    """Write the content of a Lightning checkpoint as a policy, which replaces the one in `folder`.
 
     Values in the state of the model that are not tensors must be plain.
 
@@ -59,7 +59,7 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
     nodes = {name: config[name] for name in names if name in config}
     nodes["model"] = _located(nodes["model"])
     validate = config.get("validate") or {}
-    # The data module saves the digest of the demonstrations, under a key of its class that is not known here.
+    # The data module saves the digest of the demonstrations under a key with the name of its class, unknown here.
     states = [part for part in content.values() if isinstance(part, dict)]
     trunks = {name: Source(**source) for name, source in content.get("trunks", {}).items()}
     state = without_lora(weights_of(content), content.get("lora_scale", 1.0), trunks)
@@ -69,7 +69,7 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
         for name, value in state.items()
         if isinstance(value, Tensor)
     }
-    # One text: the library writes several in an order that it draws anew, and equal policies have the same digest.
+    # One string, because safetensors writes several in random order, and equal policies must have equal digests.
     further = json.dumps({name: value for name, value in state.items() if name not in tensors})
     weights = save(tensors, {files.FURTHER: further})
     training = files.Training(
@@ -96,18 +96,18 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
 
 
 def _located(model: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the node of a model with absolute names of files and folders of weights, found from any other folder."""
+    """Return the node of a model with absolute paths of weights, files or folders, valid in any working directory."""
     located = copy.deepcopy({**model})
     encoders = ((node, "pretrained", Path.is_file) for node in mappings(located))
     parts = [(located, "trunk", Path.is_dir), (located.get("text"), "name", Path.is_dir), *encoders]
     for node, key, is_there in parts:
         if isinstance(node, dict) and isinstance(name := node.get(key), str) and is_there(Path(name)):
-            node[key] = str(Path(name).absolute())  # a link keeps its name, whose ending tells the format
+            node[key] = str(Path(name).absolute())  # links are not resolved: the suffix of their name tells the format
     return located
 
 
 def _card(config: Mapping[str, Any], spec: Mapping[str, Any], training: files.Training, count: int) -> str:
-    """Return what a person reads of a policy, with the header that the hub reads."""
+    """Return the model card of a policy, with the metadata header that the hub reads."""
     model, task = (str(config[name].get("_target_", name)).rpartition(".")[2] for name in ("model", "task"))
     parts = dict[Source, list[str]]()
     for name, source in training.trunks.items():

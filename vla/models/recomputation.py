@@ -1,4 +1,4 @@
-"""Gradient checkpointing: activations within a layer are computed again for its gradients instead of being kept."""
+"""Gradient checkpointing: activations within a layer are recomputed in the backward pass instead of being kept."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ LISTS = (nn.ModuleList, nn.Sequential)
 
 
 def recompute_layers(model: nn.Module) -> None:
-    """Keep of every layer only its input, in place; its results and names stay.
+    """Make every layer keep only its input for the backward pass, in place; results and names do not change.
 
-    Layers are the large elements of lists: those of transformers, ours as well as torch's, timm's and Hugging Face's.
-    The method of the latter's networks would not do: it is off in evaluation mode, in which a trunk is, and drops the
-    keys and values that an expert reads. Layers with buffers, as of batch normalisation, would update them twice.
+    Layers are the large elements of lists: those of transformers here, in torch, in timm and of Hugging Face, whose own
+    gradient checkpointing would not do: it is off in evaluation mode, in which trunks run, and drops the keys and
+    values that an expert reads. Layers with buffers, as of batch normalisation, are left out: they would update twice.
 
     Raises:
         UserError: there are no such layers.

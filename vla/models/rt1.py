@@ -57,7 +57,7 @@ class RT1(ContextModel, TokenModel):
     The paper has no keypoints and no proprioception token.
 
     Args:
-        context: factory of the tokens of frames; no more of the context is used.
+        context: factory of the context, of which only the tokens of the frames are used.
         layers, heads, key_width: of the transformer.
         dropout: of attention weights and feed-forward outputs.
         position_std: standard deviation of the initial position embeddings. If it is small compared with the
@@ -116,8 +116,8 @@ class RT1(ContextModel, TokenModel):
 
 
 def oldest_first(frames: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-    """Roll (B, T, N, E) frames until the oldest present one is first: -, 1, 2 → 1, 2, -; and return places (B, T) that
-    undo it. A policy has its first frames in these positions, and none sees absent ones there."""
+    """Roll (B, T, N, E) frames until the oldest present one is first, -, 1, 2 → 1, 2, -; also return (B, T) places that
+    undo it. A policy's first frames have these positions too, in which none attends to absent frames."""
     steps, first = torch.arange(present.shape[1], device=present.device), present.int().argmax(1, keepdim=True)
     rolled, back = ((steps + shift) % present.shape[1] for shift in (first, -first))
     return frames.gather(1, rolled[:, :, None, None].expand_as(frames)), back

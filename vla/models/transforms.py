@@ -1,4 +1,4 @@
-"""What happens between an observation and a model, the same in training, evaluation, serving and on a robot."""
+"""Preprocessing of observations for a model, the same in training, evaluation, serving and on a robot."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from vla.models.layers import Batch
 
 @dataclass(frozen=True)
 class Transforms:
-    """The steps, which a policy has in its configuration as `model.image_size` and `model.fit`.
+    """The preprocessing of a batch, which the configuration of a policy sets by `model.image_size` and `model.fit`.
 
-    Images are brought to the size of the demonstrations first, so that a sharper camera shows no more than training
-    did. The model itself normalises numbers, by statistics saved with its weights. Absent frames of a window are zero.
+    Images are first resized to the size of the demonstrations, so that a sharper camera shows no more than in training.
+    The model itself normalises numbers, by statistics saved with its weights. Absent frames of a window are zero.
 
     Args:
         demonstrations: height and width of their images, to which importers have cropped them [px].
-        size: those of the images that the model sees [px].
-        fit: of these, for another aspect ratio: "crop" to the centre, "pad" with black borders, or "stretch".
+        size: height and width of the images that the model sees [px].
+        fit: how another aspect ratio becomes `size`: "crop" to the centre, "pad" with black borders, or "stretch".
         tokenize: sentences → tokens.
     """
 
@@ -32,7 +32,7 @@ class Transforms:
 
     def __call__(self, batch: Batch) -> Batch:
         """Return the input of a model: its images have `image_size`, and "text" is there, made of "instruction"."""
-        # Cropped whatever `fit` is, as importers do, who know no model: so a robot's camera shows what they stored.
+        # Cropped regardless of `fit`, as by importers, which know no model, so that robots show what they stored.
         rgb = {camera: fitted(images, self.demonstrations, "crop") for camera, images in batch["rgb"].items()}
         rgb = {camera: fitted(images, self.size, self.fit) for camera, images in rgb.items()}
         text = batch["text"] if "text" in batch else self.tokenize(batch["instruction"]).to(batch["state"].device)

@@ -1,4 +1,4 @@
-"""Pretrained parts of a model that stay where they are: a policy names them, and holds what was trained beside them."""
+"""Pretrained parts of a model, whose weights a policy does not copy: it names their source and saves only the rest."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vla.io.types import Natural, Text
 
 @dataclass(frozen=True)
 class Source:
-    """Where the weights of a part come from; who loads them sets it as the attribute `source` of the module."""
+    """Where the weights of a part come from; the code that loads them sets the attribute `source` of the module."""
 
     __pydantic_config__ = STRICT
 
@@ -44,15 +44,15 @@ def is_within(name: str, parts: Collection[str]) -> bool:
 
 
 def is_factor(name: str) -> bool:
-    """Return whether a weight is a factor of LoRA, which is trained also in a frozen part."""
+    """Return whether a weight is a LoRA factor, which is trained even in a frozen part."""
     return ".lora_" in name
 
 
 def trunks(model: nn.Module) -> dict[str, Source]:
-    """Return name → source of the parts whose weights came from somewhere else and are not trained."""
+    """Return name → source of the parts whose weights were loaded from elsewhere and are not trained."""
     found = dict[str, Source]()
     for name, module in model.named_modules():
-        part = name.removesuffix(".base_layer")  # of a linear map with factors of LoRA: it is called as without them
+        part = name.removesuffix(".base_layer")  # a linear map with LoRA factors is called as without them
         source = getattr(module, "source", None)
         if not isinstance(source, Source) or is_within(part, found):
             continue
@@ -62,7 +62,7 @@ def trunks(model: nn.Module) -> dict[str, Source]:
 
 
 def evaluate_frozen(module: nn.Module) -> None:
-    """Put a part into evaluation mode, in which nothing in it changes; dropout before factors of LoRA goes on."""
+    """Put a frozen part into evaluation mode, so that its buffers do not change; LoRA's dropout stays active."""
     module.eval()
     for name, part in module.named_modules():
         part.train(is_factor(f".{name}."))
@@ -72,7 +72,7 @@ def require_trunks(model: nn.Module, named: Mapping[str, Source], policy: object
     """Require the trunks that a policy names.
 
     Raises:
-        UserError: one is not here, or is another one than in training.
+        UserError: a trunk is missing, or differs from the one in training.
     """
     modules: dict[str, Any] = dict(model.named_modules())
     for part, source in named.items():
@@ -82,9 +82,9 @@ def require_trunks(model: nn.Module, named: Mapping[str, Source], policy: object
 
 
 def whole_state(model: nn.Module, state: Mapping[str, Any], named: Collection[str]) -> dict[str, Any]:
-    """Return the state of a policy with that of the trunks it names, to which their factors of LoRA are added.
+    """Return the state of a policy with that of the trunks `named`, into which their LoRA factors are merged.
 
-    The model forgets the source of every module that this state makes something else than what came from there.
+    The attribute `source` becomes None on every module whose weights in this state differ from those of its source.
     """
     whole = {name: value for name, value in state.items() if not (is_factor(name) and is_within(name, named))}
     changed = set[str]()  # linear maps

@@ -1,4 +1,4 @@
-"""Folders of weights that others published, here or on the hub."""
+"""Folders of weights that others published, on this machine or on the hub."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OF_OTHERS = ("model_type", "input_features")  # in the config of transformers, a
 
 
 def is_trunk(name: str) -> bool:
-    """Return whether `name` is a folder of weights that others published, or names it on the hub.
+    """Return whether `name` is a folder of weights that others published, or the name of one on the hub.
 
     Raises:
         UserError: the hub cannot be reached, there is no such folder, or its config is of an unknown kind.

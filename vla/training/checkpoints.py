@@ -1,4 +1,4 @@
-"""Checkpoints of a training: saved periodically, on interruption, atomically."""
+"""Checkpoints of a training, saved atomically, periodically and on interruption."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ SAVE_EVERY = 500  # steps
 class GracefulStop(Checkpoint):
     """Saves `last.ckpt` every `SAVE_EVERY` steps, and stops a training at signals.
 
-    At the first SIGINT or SIGTERM it saves and stops after the current step, in all processes together, at the second
-    at once. Where a validation follows a step, it comes first: a checkpoint from before would skip it when resumed. As
-    a Lightning `Checkpoint` it runs after all other callbacks. It saves `finished` and the training time, `seconds`.
+    At the first SIGINT or SIGTERM it saves and stops after the current step, in all processes together; at the second
+    it stops at once. A validation that is due after the step comes first: a checkpoint saved before it would skip it.
+    As a Lightning `Checkpoint` it runs after all other callbacks. It saves `finished` and the training time, `seconds`.
     """
 
     def __init__(self, checkpoints: Path) -> None:
@@ -128,7 +128,7 @@ class GracefulStop(Checkpoint):
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints atomically, as a policy where the path is not that of a `.ckpt`. Reads them as data."""
+    """Writes checkpoints atomically, as a policy unless the path ends in `.ckpt`, and reads them as plain data."""
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
         """Return plain values and tensors, on the CPU. Raises as `read_content` does."""
@@ -138,7 +138,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         """Write a temporary file or folder, then rename it to `path`.
 
         Raises:
-            OSError: it cannot be written; what is there is unchanged.
+            OSError: it cannot be written; an existing one is unchanged.
         """
         target = Path(path)
         if target.suffix != Path(LAST).suffix:
@@ -156,11 +156,11 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 class Sharded(ModelParallelStrategy):
-    """Lightning's FSDP2, whose checkpoints are single files and policies folders, as without sharding."""
+    """Lightning's FSDP2 strategy, but with checkpoints as single files and policies as folders, as without sharding."""
 
     def __init__(self) -> None:
         super().__init__(save_distributed_checkpoint=False)
 
     def save_checkpoint(self, checkpoint: dict[str, Any], filepath: Any, storage_options: Any = None) -> None:
-        """Write what all processes have gathered; Lightning would refuse the folder of a policy that is there."""
+        """Write the state gathered from all processes; Lightning would refuse to replace the folder of a policy."""
         Strategy.save_checkpoint(self, checkpoint, filepath, storage_options)

@@ -29,11 +29,11 @@ log = logging.getLogger(__name__)
 
 ROOM = 3  # memory of a process with a model, as a multiple of its weights: they arrive pickled, and the model acts
 OF_GPU = 1e9  # memory of a process that uses a GPU, without its model: of the GPU, and of the machine [bytes]
-PER_WORKER = 5  # episodes; for fewer, a process takes longer to start than they take
+PER_WORKER = 5  # smallest number of episodes per process; fewer would take less time than its start
 
 
 class _Player:
-    """Worker that plays episodes with a copy of a model, and holds an environment only meanwhile."""
+    """Worker that plays episodes with a copy of a model, and keeps an environment only while it plays."""
 
     def __init__(self, make_environment: Callable[[], Environment], make_policy: Callable[[Model], Agent]) -> None:
         self._make_environment, self._make_policy = make_environment, make_policy
@@ -49,15 +49,15 @@ class _Player:
             return [play_episode(environment, policy, seed) for seed in seeds]
 
     def close(self) -> None:
-        """Hold nothing."""
+        """Do nothing: there are no resources to free."""
 
 
 class ClosedLoop(Callback):
     """Plays episodes with the EMA weights in every validation, and logs `val/success`, 0…1.
 
     The processes of a training split the episodes, and each has workers that share its part; a result does not depend
-    on their number. The policy with the highest success rate is saved as `policy_best`; ties go to the newest. With
-    sharded weights nothing is played: all processes would have to act in step. Its workers end with the context.
+    on their number. The policy with the highest success rate is saved as `policy_best`; ties go to the newest. No
+    episodes are played with sharded weights, as all processes would have to act in lockstep. Workers end on exit.
 
     Args:
         make_environment: factory of the environment, called for every validation, after which it is closed.
@@ -122,9 +122,9 @@ class ClosedLoop(Callback):
             pl_module.log("val/success", self.success, sync_dist=True)
 
     def play(self, learner: Learner, seeds: Sequence[int], workers: int) -> list[Result]:
-        """Return the results of the episodes of seeds with the present weights.
+        """Return the results of episodes with the given seeds and the present weights.
 
-        As many worker processes play them as have memory for a model each; if that is one only, this process plays.
+        At most as many worker processes play as have memory for a model each; if only one has, this process plays.
         """
         size = sum(weight.nbytes for weight in learner.model.parameters())
         workers = min(workers, processes_that_fit(learner.device, size))
@@ -146,9 +146,9 @@ class ClosedLoop(Callback):
             trainer.save_checkpoint(self._path, weights_only=False)
 
     def clearly_better(self) -> Path | None:
-        """Return `policy_best` if the last success rate is below the 95 % confidence interval of its own, else None.
+        """Return `policy_best` if the last success rate is below the 95 % confidence interval of the best, else None.
 
-        Smaller differences between a few episodes are chance, and longer training is better.
+        Smaller differences in a few episodes are mostly chance, and then longer training is better.
         """
         low, _ = wilson_interval(round(max(self.best, 0.0) * len(self._seeds)), len(self._seeds))
         if self.success >= low or not self._path.exists():
@@ -161,7 +161,7 @@ class ClosedLoop(Callback):
         return {"success": self.success, "best": self.best, "seeds": list(self._seeds)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the state; the best is void in another folder or with other episodes."""
+        """Restore the state, but not the best success rate in another folder or with other episodes."""
         self.success = state_dict["success"]
         if self._path.exists() and state_dict["seeds"] == list(self._seeds):
             self.best = state_dict["best"]

@@ -22,7 +22,7 @@ def now(device: torch.device) -> float:
 
 
 def memory_of(device: torch.device) -> tuple[float, float]:
-    """Return the memory that this process holds, and that it can get [bytes]; see `peak`."""
+    """Return the memory that this process holds, see `peak`, and the memory that is free for it [bytes]."""
     if device.type == "cuda":
         return torch.cuda.memory_allocated(device), torch.cuda.mem_get_info(device)[0]
     return psutil.Process().memory_info().rss - _of_files(), free_memory()
@@ -31,7 +31,7 @@ def memory_of(device: torch.device) -> tuple[float, float]:
 def peak(device: torch.device) -> float:
     """Return the largest memory of this process since `reset_peak` [bytes].
 
-    On Linux without pages of files, such as those of a store that were read: the system takes them back when needed.
+    On Linux, file-backed pages, such as those of a memory-mapped store, do not count: the system can reclaim them.
     """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
@@ -42,10 +42,10 @@ def peak(device: torch.device) -> float:
 def reset_peak(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    with suppress(OSError):  # elsewhere, and where it is forbidden, the largest of the whole process counts
+    with suppress(OSError):  # not on Linux, or forbidden: the peak since the start of the process counts
         Path("/proc/self/clear_refs").write_text("5")
 
 
 def _of_files() -> int:
-    """Return the memory of this process that shows files [bytes]; 0 where that is unknown."""
+    """Return the file-backed memory of this process [bytes]; 0 where it is unknown."""
     return getattr(psutil.Process().memory_info(), "shared", 0)

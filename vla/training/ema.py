@@ -1,4 +1,4 @@
-"""Exponential moving average of the weights, which are the ones evaluated and saved."""
+"""Exponential moving average of the weights; the averaged weights are evaluated and saved."""
 
 from __future__ import annotations
 

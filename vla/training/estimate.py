@@ -1,4 +1,4 @@
-"""What a training needs of memory and time: said before it starts, and compared with what it took."""
+"""Estimates of the memory and time of a training, logged before it starts and compared with the actual values."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from vla.training.trainer import what_to_lower
 log = logging.getLogger(__name__)
 
 TRIALS_S = 2.0  # after which no larger batch is tried [s], unless the training is long
-LONG = 500  # batches of a long training, whose trials go on up to the size of its batches
-TOLERANCE = 1.15  # a training is refused if it needs that much more than there is
+LONG = 500  # smallest number of batches of a long training, whose trials go on up to its batch size
+TOLERANCE = 1.15  # a training is refused if it needs more than this multiple of the available memory
 SCARCE = 0.5  # share of the memory above which a training says what to lower
-OPTIMIZED = 20_000_000  # numbers that a step of the optimiser is timed with
-FIRST_STEP = 40e6  # of memory that libraries take for the first step, measured for four models [bytes]
+OPTIMIZED = 20_000_000  # number of parameters with which a step of the optimiser is timed
+FIRST_STEP = 40e6  # memory that libraries allocate in the first step, measured for four models [bytes]
 GB = 1e9
 
 
 class Estimate(Callback):
     """Estimates memory and time of a training from a few steps with small batches, without changing it.
 
-    Trials of 2, 8, 32, … windows end at the size of the training's batches, or, in a short training, once they take
-    long; then the line through the last two tells the rest. Optimiser state, EMA weights and waiting batches are added.
+    Trials of 2, 8, 32, … windows end at the batch size, before they exceed the memory or, in short trainings, once they
+    take long; a line through the last two then gives the rest. Optimiser state, EMA and waiting batches are added.
 
     Args:
         config: of the training, to name what can be lowered.
@@ -46,13 +46,13 @@ class Estimate(Callback):
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         self._config, self._held, self._available = config, 0.0, 0.0  # [bytes]
-        self._peaks, self._seconds = dict[int, float](), dict[int, float]()  # windows → of a trial [bytes], [s]
+        self._peaks, self._seconds = dict[int, float](), dict[int, float]()  # windows of a trial → [bytes], [s]
         self.memory, self.seconds = 0.0, 0.0  # estimated, of the process [bytes] and of a batch [s]
-        self._took: deque[float] = deque(maxlen=1000)  # by the last batches [s]
+        self._took: deque[float] = deque(maxlen=1000)  # times of the last batches [s]
         self._began: float | None = None
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Estimate; the model is on its device.
+        """Compute the estimate; the model is on its device by now.
 
         Raises:
             UserError: the memory does not suffice.
@@ -105,7 +105,7 @@ class Estimate(Callback):
             windows = following
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Say what was estimated, for the steps that are left."""
+        """Log the estimate for the remaining steps."""
         batches = batches_left(trainer)
         scarce = self.memory > SCARCE * self._available
         advice = f"; if that is too much, {what_to_lower(self._config)}" if scarce else ""
@@ -117,18 +117,18 @@ class Estimate(Callback):
         reset_peak(pl_module.device)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Time the batch before, unless a validation came between."""
+        """Record the time of the previous batch, unless a validation came between."""
         now = time.perf_counter()
         if self._began is not None:
             self._took.append(now - self._began)
         self._began = now
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Leave a validation out."""
+        """Exclude the validation from the times."""
         self._began = None
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Say what the training took."""
+        """Log the actual memory and time."""
         if self._took:
             log.info(
                 "took %.2f GB of memory and %.0f ms for a batch, after an estimate of %.2f GB and %.0f ms",
@@ -139,7 +139,7 @@ class Estimate(Callback):
 
 @contextmanager
 def _unchanged(learner: Learner) -> Iterator[None]:
-    """Leave random numbers, buffers and gradients as they are, and compute as in training, but not compiled."""
+    """Compute as in training but uncompiled; restore random states and buffers afterwards, and clear gradients."""
     before = [buffer.clone() for buffer in learner.buffers()]
     with isolate_rng(), torch.compiler.set_stance("force_eager"):
         learner.on_fit_start()
@@ -154,7 +154,7 @@ def _unchanged(learner: Learner) -> Iterator[None]:
 
 
 def _step(trainer: Trainer, learner: Learner, batch: Any) -> float:
-    """Return the time of a step without the optimiser [s]; as in training, gradients of the one before are there."""
+    """Return the time of a step without the optimiser [s]; as in training, previous gradients are still allocated."""
     began = now(learner.device)
     with trainer.precision_plugin.train_step_context():
         loss = learner.model.loss(learner.model.augment(batch))["loss"]
@@ -164,7 +164,7 @@ def _step(trainer: Trainer, learner: Learner, batch: Any) -> float:
 
 
 def _optimizer_seconds(weights: list[Tensor], device: torch.device, averages: bool) -> float:
-    """Return the time of clipping, AdamW and EMA [s], from copies of some of the weights."""
+    """Return the time of clipping, AdamW and EMA [s], extrapolated from zeros in the shape of some of the weights."""
     some = list[Tensor]()
     for weight in weights:
         if sum(each.numel() for each in some) < OPTIMIZED:
@@ -186,7 +186,7 @@ def batches_left(trainer: Trainer) -> int:
 
 
 def extrapolated(points: Mapping[int, float], size: int) -> float:
-    """Return the value at a size: the one that is there, or that of the line through the last two."""
+    """Return the value at a size: that of its point, or else that of the line through the last two points."""
     (before, low), (last, high) = list(points.items())[-2:]
     return points[size] if size in points else high + max(high - low, 0) / (last - before) * (size - last)
 

@@ -10,11 +10,11 @@ from lightning import Callback, LightningModule, Trainer
 
 from vla.io.progress import Bar
 
-MUCH = 0.05  # share of the time that waits for data, above which the bar shows it
+MUCH = 0.05  # share of time spent waiting for data above which the bar shows it
 
 
 class Throughput(Callback):
-    """Logs throughput between two log steps, without validation.
+    """Logs throughput between two log steps, excluding validation.
 
     - `pace/samples_per_s`: samples per second of all processes.
     - `pace/waiting`: share of the time in which this process waited for data, from `waited` [s] of the data loader.

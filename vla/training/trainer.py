@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 PRECISIONS = {"fp32": "32-true", "bf16": "bf16-mixed"}  # config → Lightning
 SIZE_KEYS = ("data.batch_size", "model.context.history", "model.image_size", "model.chunk", "model.width")
-# In errors of PyTorch: on a CPU, on a GPU, and of a library of CUDA that finds no room for what it needs.
+# In error messages: of PyTorch on a CPU, of PyTorch on a GPU, and of CUDA libraries that fail to allocate memory.
 OUT_OF_MEMORY = ("can't allocate memory", "out of memory", "ALLOC_FAILED", "ALLOCATION_FAILED")
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 MAX_MMAP_THRESHOLD = 2**25  # [B]
@@ -74,7 +74,7 @@ class SyncBatchNorm(TorchSyncBatchNorm):
 
 
 def make_trainer(config: Mapping[str, Any], checkpoints: Path, *callbacks: Callback) -> Trainer:
-    """Create the trainer of a config, with EMA, and logging into the run that has the folder of checkpoints.
+    """Create the trainer of a config, with EMA, and with loggers that write into the parent folder of `checkpoints`.
 
     The given callbacks run before EMA at the end of a validation, so that they use the EMA weights.
 
@@ -98,7 +98,7 @@ def make_trainer(config: Mapping[str, Any], checkpoints: Path, *callbacks: Callb
     )
     environment = getattr(trainer.strategy, "cluster_environment", None)
     external = environment is not None and environment.creates_processes_externally
-    # Two processes are always allowed, as the smallest training of several to try.
+    # Two processes are always allowed, to try distributed training on any machine.
     if isinstance(trainer.accelerator, CPUAccelerator) and not external and trainer.num_devices > max(cores(), 2):
         raise UserError(
             f"trainer.devices={trainer.num_devices} asks for more processes than this machine has cores: set "
@@ -147,7 +147,7 @@ def explain_memory_errors(config: Mapping[str, Any]) -> Iterator[None]:
 
 
 def what_to_lower(config: Mapping[str, Any]) -> str:
-    """Return which options to change for a training of less memory."""
+    """Return which options to change so that training needs less memory."""
     keys = [f"{key} (now {size})" for key in SIZE_KEYS if (size := at(config, key, None))]
     return (
         f"lower {', '.join(keys)}; trainer.precision=bf16 and learner.checkpointing=true need less, and "
@@ -194,6 +194,6 @@ def quiet_lightning() -> None:
 
 
 def end_wandb() -> None:
-    """End the run of Weights & Biases, or the next training of this process, of a sweep or a round, goes on in it."""
+    """End the run of Weights & Biases, which the next training of a sweep or a round would continue otherwise."""
     if wandb := sys.modules.get("wandb"):
         wandb.finish()

@@ -32,7 +32,7 @@ class Files:
 
         episode_00000/manifest.json                  spec and provenance of the episode
         episode_00000/step_0000/rgb_image.png        (H, W, 3) uint8
-        episode_00000/step_0000/depth_image.npy      (H, W) float32 [m], 0: nothing, nor sky; of depth cameras
+        episode_00000/step_0000/depth_image.npy      (H, W) float32 [m], 0: nothing, not even sky; for depth cameras
         episode_00000/step_0000/robot_state.json     component of the state → value
         episode_00000/step_0000/expert_action.json   the action to imitate and the executed one, each (D,)
 

@@ -46,8 +46,8 @@ class ImportedDemonstrations(ABC):
 
     @classmethod
     def recording(cls, **options: Any) -> Recording:
-        """Describe the recording that `options`, the arguments of the constructor but the spec, name (UserError: it is
-        missing or damaged, or this format is for given tasks only)."""
+        """Describe the recording named by `options`, the arguments of the constructor without the spec (UserError: it
+        is missing or damaged, or this format is for given tasks only)."""
         raise UserError(f"{cls.__name__} does not describe its recordings: choose the task that they are of")
 
     @abstractmethod
@@ -60,7 +60,7 @@ class ImportedDemonstrations(ABC):
 
     @abstractmethod
     def numbers(self, number: int) -> tuple[str, Array, Array]:
-        """Return what is known of an episode without its images: instruction, state (N, P) and actions (N, D)."""
+        """Return an episode without its images: instruction, state (N, P) and actions (N, D)."""
 
     def recorded_episode(
         self,
@@ -72,7 +72,7 @@ class ImportedDemonstrations(ABC):
         actions: Array,
         executed: Array | None = None,
     ) -> Episode:
-        """Make an episode of its rows, by field, without depth, which is 0, and of actions (N, D), to be clipped."""
+        """Make an episode from its rows by field, except depth, which is set to 0, and from actions (N, D), clipped."""
         spec = self.spec
         depth = {f"depth_{camera}": np.zeros((len(actions), *spec.image_size), np.uint16) for camera in spec.depth}
         clipped = self._clipped(actions)
@@ -100,7 +100,7 @@ class ImportedDemonstrations(ABC):
         store.require_growable()
         with store.writing():  # another process may have added some meanwhile
             first = store.next_seed or 0
-            if (possible := len(store.episodes) + len(self) - first) < episodes:  # damaged ones do not come back
+            if (possible := len(store.episodes) + len(self) - first) < episodes:  # damaged ones are not imported again
                 raise UserError(f"only {possible} episodes are whole: set collect.episodes={possible}, or fewer")
             missing = range(first, first + episodes - len(store.episodes))
             for number in track(missing, "importing"):
@@ -111,7 +111,7 @@ class ImportedDemonstrations(ABC):
         return np.clip(actions, self.spec.low, self.spec.high).astype(np.float32)
 
     def require_enough(self, episodes: int) -> None:
-        """Raise a UserError if there are fewer recorded episodes than that."""
+        """Raise a UserError if there are fewer than `episodes` recorded episodes."""
         if episodes > len(self):
             raise UserError(f"there are only {len(self)} recorded episodes: set collect.episodes={len(self)}, or fewer")
 

@@ -1,7 +1,7 @@
 """A LeRobot dataset on disk, checked as a whole when it is opened: metadata, episodes, numbers and images.
 
-The rows of an episode are those with its number, in whichever file. Files that metadata name, and numbers of rows, may
-be out of date after episodes were merged or deleted.
+The rows of an episode are those with its number, in any file: the files and row numbers in the metadata may be out of
+date after episodes were merged or deleted.
 
 Shapes: N steps, D components, H by W pixels.
 """
@@ -82,8 +82,8 @@ class LeRobotDataset:
         """Return component → its feature and index, of several features in order (UserError: there is no such feature,
         or it is no vector of a reasonable size).
 
-        Unnamed components, or with `in_order` all, are called by `anonymous` if there are as many; else unnamed ones by
-        their feature and index.
+        If there are as many components as names in `anonymous`, these name unnamed components, or with `in_order` all.
+        Otherwise unnamed components are called by their feature and index.
         """
         features = self.info.features
         vectors = [key for key, feature in features.items() if len(feature.shape) == 1]
@@ -160,7 +160,7 @@ class LeRobotDataset:
                 raise UserError(f"{found} of the {count} steps that meta/episodes counts of episode {number}: {remedy}")
             self._require_even(number, times - times[0])
             files = tuple(paths[each] for each in np.unique(file[steps]))
-            # What is done after a change of the task is no answer to the instruction before it.
+            # Actions after a change of the task do not follow the instruction before it.
             changes = np.flatnonzero(np.diff(tasks[steps])) + 1
             for begin, last in pairwise([0, *changes.tolist(), len(steps)]):
                 if (task := int(tasks[steps[begin]])) not in instructions:
@@ -179,7 +179,7 @@ class LeRobotDataset:
         rows = tables.read(tables.files(folder), columns).sort_by(OWNER).to_pylist()
         if twice := [row[OWNER] for row, other in pairwise(rows) if row[OWNER] == other[OWNER]]:
             raise UserError(f"{folder} lists episode {twice[0]} more than once: {MEND}")
-        # Of half a copy the totals are those of the whole; more episodes than they say are no damage.
+        # An incomplete copy has the totals of the whole dataset; more episodes than in the totals are no damage.
         counts = (
             ("episodes", len(rows), self.info.total_episodes),
             ("frames", sum(row[TO] - row[FROM] for row in rows), self.info.total_frames),
@@ -242,7 +242,7 @@ class LeRobotDataset:
         return self.folder / layout.VIDEOS.format(video_key=key, chunk_index=chunk, file_index=file)
 
     def _require_videos(self, keys: Sequence[str]) -> None:
-        """Require the videos of all episodes to be there, with the size, the rate and the images that these need."""
+        """Require the videos of all episodes to exist, with the size, rate and number of images that these need."""
         frames: dict[tuple[Path, str], int] = {}
         for part in self.parts:
             for key in keys:
@@ -256,7 +256,7 @@ class LeRobotDataset:
             require_video(path, self.info.features[key].image_size, layout.fraction(self.info.fps), count)
 
     def _require_even(self, number: int, times: Array) -> None:
-        """Require the times of an episode, those since its first step, to follow the rate, without gaps."""
+        """Require the times of an episode, counted from its first step, to follow the frame rate without gaps."""
         fps, steps = self.info.fps, np.arange(len(times))
         off = np.abs(times - steps / fps) > (0.5 + layout.RATE_TOLERANCE * steps) / fps
         off |= np.abs(np.diff(times, prepend=-1 / fps) - 1 / fps) > 0.5 / fps  # a step that was left out

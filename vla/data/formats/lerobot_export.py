@@ -206,7 +206,7 @@ def _moments(values: Array) -> Statistics:
 
 
 def _image_moments(counts: Array, images: int) -> Statistics:
-    """Compute the same of images in the range 0…1 from their histograms, `counts` (3, 256); shape (3, 1, 1)."""
+    """Compute the same statistics of images in 0…1 from their histograms, `counts` (3, 256); each (3, 1, 1)."""
     levels, total = np.arange(256) / 255, counts.sum(1)
     mean = counts @ levels / total
     rising = counts.cumsum(1) / total[:, None]

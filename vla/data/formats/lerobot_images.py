@@ -87,7 +87,7 @@ def decode(
 
 
 def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) -> None:
-    """Raise a UserError unless the header of a video gives images of `size` (H, W), `count` of them, and their rate.
+    """Raise a UserError unless the header of a video states `size` (H, W), at least `count` images, and the rate.
 
     The rate may differ as long as the first `count` images are the right ones.
     """
@@ -106,10 +106,10 @@ def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
-    """Open a video and its first stream; errors within, of reading it, become a UserError."""
+    """Open a video and its first stream; errors of reading it within the context become a UserError."""
     require_file(path)
     try:
-        with av.open(path, format="mp4") as file:  # others are lists of further files, wherever they are
+        with av.open(path, format="mp4") as file:  # other formats may be playlists of files anywhere
             yield file, file.streams.video[0]
     except (av.error.FFmpegError, OSError, IndexError) as error:
         raise UserError(f"{path} cannot be read as a video: {error}") from error

@@ -24,7 +24,7 @@ from vla.spec import Array, Episode, Spec
 Keys = Annotated[list[Text], MinLen(1), Predicate(unique)]
 Places = Mapping[str, tuple[str, int]]  # component → feature and index
 
-# Share of a component's actions beyond its bounds that means other units: bounds from quantiles exclude 2 %.
+# If a larger share of a component's actions is beyond its bounds, units differ: bounds from quantiles exclude 2 %.
 MAX_OUTSIDE = 0.02
 MAX_NAMES = 200  # characters of names from a dataset in a message
 
@@ -140,12 +140,12 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         return self.recorded_episode(number, words, "success", recorded, rows, actions, executed)
 
     def numbers(self, number: int) -> tuple[str, Array, Array]:
-        """Return what is known of an episode without its images: instruction, state (N, P) and actions (N, D)."""
+        """Return an episode without its images: instruction, state (N, P) and actions (N, D)."""
         part, (first, last) = self._dataset.parts[number], self._steps(number)
         return part.instruction, self._states(part.rows)[first], self._actions[last]
 
     def _steps(self, number: int) -> tuple[Array, Array]:
-        """Return the first step of every period of an episode, and the row of the last: the target at its end."""
+        """Return the first step of every period of an episode, and the row of its last, whose action is the target."""
         part = self._dataset.parts[number]
         first = np.arange(part.steps.start, part.steps.stop, self._every)
         return first, part.rows[np.minimum(first + self._every - 1, part.steps.stop - 1)]

@@ -33,7 +33,7 @@ TASKS = "meta/tasks.parquet"
 CHECKSUMS = "meta/checksums.json"
 FILES_PER_CHUNK = 1000
 CHANNELS = (1, 3, 4)  # of images: grey, colours, colours and transparency
-RATE_TOLERANCE = 0.01  # relative; cameras of 29.97 Hz are said to have 30
+RATE_TOLERANCE = 0.01  # relative; datasets state 30 Hz for cameras of 29.97 Hz
 
 # LeRobot's policies use every feature "observation…" as an input, every "action…" as an output, and every image as a
 # colour image: other features have other names.
@@ -80,7 +80,7 @@ class Feature:
 
     @property
     def is_depth(self) -> bool:
-        """True if the images are depth."""
+        """True if the images are depth images."""
         told = [part for part in (self.info, self.video_info) if isinstance(part, dict)]
         return any(True in (part.get("is_depth_map"), part.get("video.is_depth_map")) for part in told)
 
@@ -93,7 +93,7 @@ class Info:
 
     fps: Positive
     features: dict[str, Feature]
-    total_episodes: Natural = 0  # those of a part of a dataset are larger than what it holds
+    total_episodes: Natural = 0  # in a part of a dataset, totals are larger than what it holds
     total_frames: Natural = 0
 
 

@@ -1,4 +1,4 @@
-"""Tables of a LeRobot dataset: untrusted ones are bounded in rows and of the expected types, and new ones.
+"""Tables of a LeRobot dataset: reads untrusted ones, with limits of size and expected types, and writes new ones.
 
 Shapes: N steps, D components.
 """

@@ -1,4 +1,4 @@
-"""Names of colours in basic terms: crimson is red, though training never says so."""
+"""Names of colours as basic colour terms: crimson is read as red, even if it never occurs in training."""
 
 from __future__ import annotations
 

@@ -28,11 +28,11 @@ from vla.models.text.ngrams import TextEncoder
 log = logging.getLogger(__name__)
 
 WEIGHTS = "model*.safetensors"
-ADAPTER = "adapter_config.json"  # of weights that transformers would add, whose SHA-256 is not known
+ADAPTER = "adapter_config.json"  # of an adapter that transformers would load, but whose SHA-256 would not be checked
 FILES = ("config.json", "tokenizer.json", "tokenizer_config.json", WEIGHTS, "model.safetensors.index.json")
 KEPT = 1 << 13  # sentence vectors, 4 kB of 1024 components each
 
-# Models that are more than an encoder of texts: class of this part, and which of its outputs is a sentence vector.
+# Models that contain more than a text encoder → class of that part, and its output that is a sentence vector, if any.
 TEXT_PARTS = {
     "clip": ("CLIPTextModelWithProjection", "text_embeds"),
     "metaclip_2": ("MetaClip2TextModelWithProjection", "text_embeds"),
@@ -57,7 +57,7 @@ class SentenceEncoder:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._vectors: dict[str, Tensor] = {}  # those of an encoder that is gone would keep its network
+        self._vectors: dict[str, Tensor] = {}  # per encoder: a shared cache would keep its network in memory
         try:
             self.network, self._output = _network(folder)
             self._tokenizer = _tokenizer(folder, self.network.config)
@@ -75,7 +75,7 @@ class SentenceEncoder:
         return self
 
     def embed(self, sentence: str) -> Tensor:
-        """Return the trained sentence vector, or else the mean over all tokens, (E,) float32."""
+        """Return the vector of a sentence, (E,) float32: the network's own if it has one, else the mean over tokens."""
         found = self._vectors.get(sentence)
         if found is None:
             if len(self._vectors) >= KEPT:
@@ -93,7 +93,7 @@ class SentenceEncoder:
 class HuggingFace(TextEncoder):
     """A frozen sentence or text encoder of Hugging Face with a trained projection.
 
-    A policy holds the projection, and names the encoder, by the SHA-256 of its weights too: they stay where they are.
+    A policy saves only the projection; it identifies the encoder by its name and the SHA-256 of its weights.
 
     Args:
         name: folder of the encoder, or its name on the hub, OWNER/NAME or OWNER/NAME@REVISION, or a zip archive of such
@@ -129,7 +129,7 @@ class HuggingFace(TextEncoder):
         return {"sha256": self.encoder.sha256, "revision": self._revision}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Raise a UserError if the frozen encoder is another than that of a training."""
+        """Raise a UserError if the frozen encoder differs from the one in training."""
         trained = state.get("sha256") if isinstance(state, dict) else self.encoder.sha256  # sharded models load none
         if trained != self.encoder.sha256:
             revision = f", revision {state.get('revision')}" if state.get("revision") else ""
@@ -181,7 +181,7 @@ def _network(folder: Path) -> tuple[Any, str | None]:
 
 
 def _tokenizer(folder: Path, config: Any) -> Any:
-    """Return the tokenizer in a folder, which cuts texts to the limit of the network."""
+    """Return the tokenizer in a folder, which truncates texts to the maximum length of the network."""
     tokenizer = transformers.PreTrainedTokenizerFast.from_pretrained(folder)
     length = min(tokenizer.model_max_length, getattr(config, "max_position_embeddings", tokenizer.model_max_length))
     backend = tokenizer.backend_tokenizer

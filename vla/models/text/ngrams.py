@@ -22,7 +22,7 @@ from vla.models.text.colours import in_basic_terms
 
 PADDING = 0
 CHARACTERS = 3  # length of character n-grams
-KEPT = 1 << 13  # hashes of sentences, 1.5 kB each, ten of the longest ones
+KEPT = 1 << 13  # sentences whose hashes are cached: 1.5 kB each, 10 kB for the longest
 INITIAL_STD = 0.1  # of embeddings; small, so that untrained n-grams have little effect
 PRIME, FACTOR = 2**31 - 1, 1_000_003  # of the polynomial hash of n-grams; its products fit into 64 bits
 
@@ -53,7 +53,7 @@ class NGrams(TextEncoder):
     """Mean of learned embeddings of the hashed words and n-grams of a sentence; needs no download.
 
     Trigrams of words distinguish "put the red block on the blue block" from "put the blue block on the red block",
-    which have the same bigrams. Words that training does not have are treated in one of two ways:
+    which have the same bigrams. Words that do not occur in training are treated in one of two ways:
 
     - They share n-grams of characters with known ones.
     - With `word_dropout` there are no n-grams of characters, and unknown words are left out before n-grams are taken:
@@ -66,11 +66,11 @@ class NGrams(TextEncoder):
         dropout: rate at which n-grams are dropped in training, which imitates unknown words.
         word_dropout: rate at which words are left out in training; None: unknown words are not left out.
         basic_colours: whether names of colours are replaced by basic terms, see `vla.models.text.colours`.
-        synonyms: words → others that are replaced by them, such as "pick up" → "grab" and "lift"; "" leaves them out.
+        synonyms: replacement → words that it replaces, such as "pick up" → "grab" and "lift"; "" removes its words.
         width: length of the sentence vector.
 
     Raises:
-        UserError: words are synonyms of different ones.
+        UserError: `synonyms` has a word more than once.
     """
 
     heard: Tensor  # (vocabulary,) bool: rows of the words seen in training; None without word dropout
@@ -113,10 +113,10 @@ class NGrams(TextEncoder):
         return self.norm(self.embedding(rows).sum(1) / count)
 
     def _known(self, tokens: Tensor, rate: float) -> Tensor:
-        """Leave words out of (B, W) tokens: in training at a rate, otherwise those that training did not have."""
+        """Drop words from (B, W) tokens: in training at random, at `rate`, otherwise those unknown from training."""
         rows = self._rows(tokens)
         if self.training:
-            self.heard.index_fill_(0, rows.flatten(), True)  # each process its own; those of the first are saved
+            self.heard.index_fill_(0, rows.flatten(), True)  # in each process; those of the first one are saved
             left_out = torch.rand(tokens.shape, device=tokens.device) < rate
         else:
             left_out = ~self.heard[rows]
@@ -133,7 +133,7 @@ def words_of(sentence: str) -> list[str]:
 
 
 def _replaced(synonyms: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """Return words → what replaces them, the longest first; words that others are replaced by stay."""
+    """Return words → their replacement, the longest first; replacements are mapped to themselves."""
     pairs = [(word, chosen) for chosen, others in synonyms.items() for word in (chosen, *others) if word]
     if twice := sorted({word for word, _ in pairs if sum(word == other for other, _ in pairs) > 1}):
         raise UserError(f"model.text.synonyms has {', '.join(map(repr, twice))} more than once: omit all but one")
@@ -144,7 +144,7 @@ def _replaced(synonyms: Mapping[str, Sequence[str]]) -> dict[str, str]:
 def _hashes(
     sentence: str, vocabulary: int, longest: int | None, basic_colours: bool, replaced: tuple[tuple[str, str], ...]
 ) -> Tensor:
-    """Return the hashes of the n-grams of up to `longest` words and of characters, or without it of the words."""
+    """Return the hashes of n-grams of up to `longest` words and of characters, or, if it is None, of the words."""
     if replaced:
         table = dict(replaced)
         sentence = re.sub(rf"\b(?:{'|'.join(map(re.escape, table))})\b", lambda word: table[word[0]], sentence.lower())
@@ -161,7 +161,7 @@ def _word_ngrams(words: list[str], longest: int) -> list[str]:
 
 
 def _character_ngrams(words: list[str]) -> list[str]:
-    """Return the n-grams of characters of every word with marks of its ends; # tells them from words."""
+    """Return the character n-grams of every word with its ends marked; the prefix # tells them from words."""
     marked = [f"<{word}>" for word in words]
     return [f"#{word[i : i + CHARACTERS]}" for word in marked for i in range(len(word) - CHARACTERS + 1)]
 

@@ -30,7 +30,7 @@ class Fast(ActionTokenizer):
     """Byte-pair encoding of the rounded cosine transform of each component, low frequencies first.
 
     Smooth motions have few non-zero coefficients, and byte-pair encoding merges frequent sequences, so the length
-    varies, up to k·D tokens and an end token. In generated ones missing coefficients are 0, surplus ones are cut.
+    varies, up to k·D tokens and an end token. In generated sequences, missing coefficients are 0, surplus ones dropped.
 
     A chunk counts in the loss as a whole, and only if nothing in it is perturbed.
 
@@ -104,7 +104,7 @@ class Fast(ActionTokenizer):
     def loss_mask(self, tokens: Tensor, perturbations: Tensor) -> Tensor:
         """Return the (…, L) bool loss mask: tokens up to the first end token of chunks in which nothing is perturbed.
 
-        Every token depends on all actions of a chunk. Actions that repeat the last one of an episode are meant to be.
+        Every token depends on all actions of a chunk, including those that repeat the last one of an episode.
         """
         ended = (tokens == self.end).cumsum(-1)
         whole = perturbations.amax(-1) == 0
@@ -116,7 +116,7 @@ class Fast(ActionTokenizer):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the fitted values; a UserError if they are damaged."""
-        if type(state).__name__ == "_EXTRA_STATE":  # PyTorch's mark of what a sharded model is not to load
+        if type(state).__name__ == "_EXTRA_STATE":  # PyTorch's placeholder in sharded models, with nothing to load
             return
         try:
             self._least, self._most = map(int, state["coefficients"])
@@ -151,7 +151,7 @@ class Fast(ActionTokenizer):
     def _round(self, actions: Tensor) -> Tensor:
         """Transform (…, k, D) actions to (…, k, D) rounded coefficients, by frequency and component.
 
-        Less than full precision would change some.
+        Less than full precision would change some coefficients.
         """
         inside = actions.clamp(self.low, self.high)
         return (exact_product(self.basis, (inside - self.centre) / self.spread) * self.scale).round()

@@ -161,9 +161,9 @@ class EvenBins(PerComponent):
 class Uniform(EvenBins):
     """Uniform bins over the range of the data, with Gaussian targets around the correct bin.
 
-    An action is decoded as the expectation over the most likely window of bins. It is finer than a bin, and modes
-    further apart than the window are not averaged. Decoding the most likely bin instead would prefer a sharp peak of
-    little weight, such as standing still, over a broad mode of more weight.
+    An action is decoded as the expectation over the most likely window of bins. The result is finer than a bin, and
+    modes further apart than the window are not averaged. Decoding the most likely bin instead would prefer a sharp peak
+    of little weight, such as standing still, over a broad mode of more weight.
 
     Args:
         bins: K.
@@ -225,7 +225,7 @@ class RT1Bins(EvenBins):
     Args:
         bins: K.
         spec: gives the units of the components.
-        statistics: unused, as in the signature of every tokenizer.
+        statistics: unused; part of the signature of every tokenizer.
     """
 
     def __init__(self, bins: Bins, *, spec: Spec, statistics: ActionStatistics | None = None) -> None:
@@ -267,7 +267,7 @@ def out_of_bounds(tokenizer: ActionTokenizer, chunks: np.ndarray) -> float:
 
 
 def rounding(tokenizer: ActionTokenizer, chunks: np.ndarray, spec: Spec) -> tuple[str, float]:
-    """Return the component of (N, k, D) chunks that loses most as tokens, and its mean error, a share of its range."""
+    """Return the component of (N, k, D) chunks that tokens round most, and its mean error as a share of its range."""
     actions = torch.from_numpy(np.array(chunks, np.float32))
     error = (tokenizer.detokenize(tokenizer.tokenize(actions)) - actions).abs().mean((0, 1)).numpy()  # (D,)
     span = np.maximum(chunks.max((0, 1)) - chunks.min((0, 1)), MIN_SPAN * (np.array(spec.high) - np.array(spec.low)))

@@ -237,6 +237,6 @@ class RandomShift(nn.Module):
         row, column = torch.stack(offsets).view(len(rgb), 2, clips, 1, 1).unbind(1)  # (cameras, B, 1, 1) each
         first = tall * torch.arange(len(rgb) * clips * frames, device=device).view(len(rgb), clips, frames, 1)
         starts = (first + row + torch.arange(height, device=device)) * wide + column  # of rows [px]
-        runs = padded.flatten().unfold(0, 3 * width, 3)  # from every pixel as many as a row has, without a copy
+        runs = padded.flatten().unfold(0, 3 * width, 3)  # a row's length of pixels from every pixel on, without a copy
         shifted = runs.index_select(0, starts.flatten()).view(len(rgb), *images[0].shape)
         return dict(zip(rgb, shifted, strict=True))

@@ -1,1 +1,1 @@
-"""Vision-language-action models: a pretrained vision-language model with an expert for actions."""
+"""Vision-language-action models: a pretrained vision-language model with an action expert."""

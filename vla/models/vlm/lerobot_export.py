@@ -1,4 +1,4 @@
-"""Vision-language-action models as folders that LeRobot's own classes load."""
+"""Export of vision-language-action models as folders that LeRobot's own classes load."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STATE, ACTION = "observation.state", "action"
 class LeRobotPolicyExporter:
     """Writes a trained policy in LeRobot's layout: config.json, model.safetensors, and its processors with statistics.
 
-    The state has the components that the model uses, which are no rates. The folder is written atomically.
+    The state has only the components that the model uses: no rates of change. The folder is written atomically.
 
     Args:
         folder: output folder, which must not exist.
@@ -54,7 +54,7 @@ class LeRobotPolicyExporter:
         beginnings = [(ours, theirs) for theirs, ours in model.network.published]
         state = model.network.state_dict()
         weights = {renamed(name, beginnings): tensor.detach().cpu().contiguous() for name, tensor in state.items()}
-        # No action depends on these, but LeRobot's π0 and π0.5 say that they could not be loaded where one is missing.
+        # No action depends on these, but LeRobot's π0 and π0.5 report a failure to load if one is missing.
         shape = model.network.vocabulary, model.network.unused_width
         weights[f"{model.network.unused[0]}weight"] = torch.zeros(shape, dtype=torch.bfloat16)
         config, steps = _config(model), (_preprocessing(model), _postprocessing(model))

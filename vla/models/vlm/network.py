@@ -1,7 +1,7 @@
-"""The networks of vision-language-action models: a prefix of images and sentence, and a velocity of actions given it.
+"""The networks of vision-language-action models: a prefix of images and sentence, and the velocity of actions given it.
 
 Shapes: B batch, C cameras, L tokens of the sentence, S state, P tokens of the prefix, k action chunk, A components of
-an action as the network has them, padded.
+a padded action, as in the network.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from transformers.models.llama.modeling_llama import apply_rotary_pos_emb
 from vla.io.errors import UserError
 from vla.io.types import Count, Layers, Width
 
-MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the embedding of a time
+MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the time embedding
 
 Rotation = tuple[Tensor, Tensor]  # cosines and sines of positions, (B, N, H) each
 Layered = tuple[Tensor, Tensor, Tensor]  # tokens after a layer, (B, N, E), and their keys and values in it
 
 
 class Prefix(NamedTuple):
-    """What actions attend to: images, sentence and perhaps state, encoded once per plan and never changed."""
+    """What actions attend to: images, sentence and in some models the state, encoded once per plan, never modified."""
 
     keys: tuple[Tensor, ...]  # of each layer, (B, heads, P, width of a head), positions applied
     values: tuple[Tensor, ...]  # of each layer, (B, heads, P, width of a head)
@@ -33,12 +33,12 @@ class Prefix(NamedTuple):
 
 
 class Own:
-    """Keys and values of the tokens of a layer, which attend to others before them too.
+    """Keys and values of the tokens of a layer, which attend to preceding tokens too.
 
-    It is where transformers has a cache, and adds to none: a prefix stays as it is.
+    It takes the place of a cache of transformers, but nothing is added to the preceding ones: a prefix never changes.
 
     Args:
-        others: keys and values, (B, heads, P, width of a head) each.
+        others: keys and values of preceding tokens, (B, heads, P, width of a head) each.
     """
 
     keys: Tensor
@@ -48,7 +48,7 @@ class Own:
         self._others = others
 
     def update(self, keys: Tensor, values: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
-        """Keep (B, heads, N, width of a head) keys and values, and return all that are seen.
+        """Keep (B, heads, N, width of a head) keys and values, and return all that the tokens attend to.
 
         Versions of transformers differ in what else they pass.
         """
@@ -59,23 +59,23 @@ class Own:
 
 
 class WithKeys(nn.Module):
-    """A base in front of a layer of transformers, which returns keys and values beside its tokens.
+    """Mixin for a layer of transformers, which makes it return keys and values beside its tokens.
 
-    Were they left in a cache, their gradients would come past FSDP, which gathers the weights of a layer for them.
+    Left in a cache, their gradients would bypass FSDP, which gathers a layer's weights when they reach its outputs.
     """
 
     def forward(self, hidden: Tensor, others: tuple[Tensor, Tensor] | None = None, **attention: Any) -> Layered:
-        """Pass (B, N, E) tokens, which attend to others before them too, whose keys and values are given."""
+        """Process (B, N, E) tokens, which attend to preceding tokens too, given the keys and values of these."""
         own, layer = Own(others), super()
         hidden = layer.forward(hidden, past_key_values=own, **attention)
         return hidden, own.keys, own.values
 
 
 class LastLayer(nn.Module):
-    """The last layer of a trunk, from which actions see keys and values; what else it would compute, nobody sees.
+    """The last layer of a trunk, which computes only keys and values: nothing depends on its other results.
 
     Args:
-        layer: of Llama or Gemma, as transformers has them, whose parts it takes.
+        layer: a Llama or Gemma layer of transformers, whose parts it takes.
     """
 
     def __init__(self, layer: Any) -> None:
@@ -85,7 +85,7 @@ class LastLayer(nn.Module):
         self.post_attention_layernorm, self.mlp = Unused(layer.post_attention_layernorm), Unused(layer.mlp)
 
     def forward(self, hidden: Tensor, position_embeddings: Rotation, **_: Any) -> Layered:
-        """Return (B, N, E) tokens as they are, with their keys and values."""
+        """Return (B, N, E) tokens unchanged, with their keys and values."""
         normed, attention = self.input_layernorm(hidden), self.self_attn
         keys, values = (
             project(normed).unflatten(-1, (-1, attention.head_dim)).transpose(1, 2)
@@ -98,7 +98,7 @@ class Unused(nn.Module):
     """Weights of a published policy that no action depends on, under their names and without gradients.
 
     Args:
-        module: whose weights they are.
+        module: the module that has the weights.
     """
 
     def __init__(self, module: nn.Module) -> None:
@@ -110,16 +110,16 @@ class Unused(nn.Module):
 
 
 def shorten(trunk: Any, kind: type[WithKeys]) -> None:
-    """Let a Llama or Gemma of transformers end, in place, with the keys and values of its last layer.
+    """Truncate a Llama or Gemma of transformers, in place, after the keys and values of its last layer.
 
-    All layers return theirs: `kind` is that class of them.
+    All layers return their keys and values; `kind` is the class that does so.
     """
     return_keys(trunk, kind)
     trunk.layers[-1], trunk.norm = LastLayer(trunk.layers[-1]), Unused(trunk.norm)
 
 
 def return_keys(network: Any, kind: type[WithKeys]) -> None:
-    """Make the layers of a Llama or Gemma of transformers those of a class, in place."""
+    """Make the layers of a Llama or Gemma of transformers instances of `kind`, in place."""
     for layer in network.layers:
         layer.__class__ = kind
 
@@ -127,13 +127,13 @@ def return_keys(network: Any, kind: type[WithKeys]) -> None:
 class FlowNetwork(nn.Module, ABC):
     """A pretrained trunk with an expert that predicts the velocity of noisy actions.
 
-    The prefix never attends to the actions. So training computes it too, once for a batch, and the gradients of the
-    velocity reach the trunk through its keys and values.
+    The prefix never attends to the actions, so training, too, computes it only once per batch, and the gradients of the
+    velocity reach the trunk through the keys and values of the prefix.
 
-    A subclass is built as `network()` by the factory of a YAML node: all sizes are its arguments.
+    A YAML node is a factory, called as `network()`, of a subclass: all sizes are its arguments.
 
     Args:
-        vocabulary: number of tokens of the sentence.
+        vocabulary: number of different tokens in sentences.
         width, layers, heads, head_width, feedforward: of the language model.
         vision_width, vision_layers, vision_heads, vision_feedforward: of the image encoder, a vision transformer.
         resolution: height and width of an image [px].
@@ -145,19 +145,19 @@ class FlowNetwork(nn.Module, ABC):
         UserError: sizes do not divide each other.
     """
 
-    # How published weights are named, those of a whole policy of LeRobot and those of the vision-language model alone:
-    # beginnings of names there and here. The first that fits counts.
+    # Names of weights in a whole policy of LeRobot, and in the vision-language model alone: pairs of how they begin
+    # there and here. The first match counts.
     published: ClassVar[tuple[tuple[str, str], ...]] = ()
     pretrained: ClassVar[tuple[tuple[str, str], ...]] = ()
-    # Beginnings of the published names of an output of words, which no action depends on; LeRobot's comes first.
+    # Beginnings of the published names of a language-model head, which no action depends on; LeRobot's comes first.
     unused: ClassVar[tuple[str, ...]] = ()
 
     kind: ClassVar[str] = ""  # LeRobot's name of the policy
-    causal: ClassVar[bool] = False  # whether an action attends to none after it
+    causal: ClassVar[bool] = False  # whether actions never attend to later ones
 
     state_width: int  # S, padded with zeros; 0: the state is part of the sentence
-    value_width: int  # values of a token in a layer, of all heads
-    unused_width: int  # of a token from which words would be put out
+    value_width: int  # width of the values of a token in a layer, over all heads
+    unused_width: int  # width of the input of the unused language-model head
 
     def __init__(
         self,
@@ -184,7 +184,7 @@ class FlowNetwork(nn.Module, ABC):
         require_multiple("expert_width", expert_width, "two", 2)
         self.vocabulary, self.resolution, self.action_width = vocabulary, resolution, action_width
         self.width, self.head_width, self.expert_width = width, head_width, expert_width
-        # Sizes under the names that transformers has for them: of all layers, and further ones of each part.
+        # Sizes under their names in transformers: those shared by trunk and expert, and those of each part.
         self.shared = {"num_attention_heads": heads, "head_dim": head_width, "num_hidden_layers": layers}
         self.text = {"vocab_size": vocabulary, **sizes(width, feedforward)}
         self.vision = {"num_hidden_layers": vision_layers, "num_attention_heads": vision_heads, "patch_size": patch}
@@ -192,7 +192,7 @@ class FlowNetwork(nn.Module, ABC):
         self.of_expert = sizes(expert_width, expert_feedforward)
 
     def options(self) -> dict[str, Any]:
-        """Return the options by which LeRobot describes this network, as far as they are not its defaults."""
+        """Return the options by which LeRobot describes this network, where they differ from its defaults."""
         return {}
 
     @abstractmethod
@@ -216,7 +216,7 @@ class FlowNetwork(nn.Module, ABC):
 
 
 def renamed(name: str, beginnings: Iterable[tuple[str, str]]) -> str:
-    """Return a published name with its beginning as it is here, given pairs of beginnings there and here."""
+    """Return a published name as it is here, given pairs of how names begin there and here."""
     for theirs, ours in beginnings:
         if name.startswith(theirs):
             return ours + name.removeprefix(theirs)
@@ -231,14 +231,14 @@ def time_embedding(time: Tensor, width: int, precision: torch.dtype) -> Tensor:
 
 
 def with_time(hidden: Tensor, time: Tensor, mix: tuple[nn.Module, nn.Module], precision: torch.dtype) -> Tensor:
-    """Join (B, k, F) actions with their times, (B,) or (B, k), by an MLP of two layers; (B, k, F)."""
+    """Fuse (B, k, F) actions with their times, (B,) or (B, k), by an MLP of two layers; returns (B, k, F)."""
     clock = time_embedding(time, hidden.shape[-1], precision).to(hidden.dtype)
     clock = (clock if time.dim() == 2 else clock.unsqueeze(1)).expand_as(hidden)
     return mix[1](nn.functional.silu(mix[0](torch.cat([hidden, clock], -1))))
 
 
 def sizes(width: int, feedforward: int) -> dict[str, int]:
-    """Return the sizes of the layers of a transformer under the names that transformers has for them."""
+    """Return the sizes of the layers of a transformer under their names in the package transformers."""
     return {"hidden_size": width, "intermediate_size": feedforward}
 
 

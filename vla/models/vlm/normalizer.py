@@ -1,4 +1,4 @@
-"""Normalisation of states and actions by statistics of a dataset, which have the names that LeRobot gives them.
+"""Normalisation of states and actions by statistics of a dataset, which have LeRobot's names.
 
 Shapes: N steps, W components, … any leading dimensions.
 """
@@ -16,13 +16,13 @@ from vla.io.errors import UserError
 
 Kind = Literal["mean_std", "quantiles"]
 MODES: dict[Kind, str] = {"mean_std": "MEAN_STD", "quantiles": "QUANTILES"}  # LeRobot's names
-CONSTANT = 1e-6  # largest range of a component that never changes
-RARE = 0.02  # largest share of the range between the percentiles of a component that rarely does
-EPSILON = 1e-8  # of a standard deviation, and in place of a range of 0
+CONSTANT = 1e-6  # a component with at most this range counts as never changing
+RARE = 0.02  # a component whose percentiles are at most this share of its range apart counts as rarely changing
+EPSILON = 1e-8  # added to a standard deviation, and used in place of a range of 0
 
 
 class Normalizer(nn.Module):
-    """Values → mean 0 and standard deviation 1, or the first percentile at -1 and the last at 1; nothing is clipped.
+    """Scales values to mean 0 and standard deviation 1, or percentiles 1 and 99 to -1 and 1; nothing is clipped.
 
     Args:
         kind: which of the two.
@@ -42,10 +42,10 @@ class Normalizer(nn.Module):
         self.register_buffer(self.statistics[1], torch.ones(width))
 
     def fit(self, values: np.ndarray, constant: float = 0.0) -> None:
-        """Take the statistics of (N, W) values.
+        """Compute the statistics of (N, W) values.
 
-        Percentiles of a component that rarely changes, such as that of a gripper, are its extremes: else its changes
-        would be huge. A component that never changes gets `constant` as its standard deviation.
+        The extremes of a component that rarely changes, such as a gripper, take the place of its percentiles, or its
+        changes would be huge. One that never changes gets `constant` as its standard deviation, or half its range.
         """
         least, most = values.min(0), values.max(0)
         spread = np.where(most - least > CONSTANT, 0.0, constant)
@@ -59,10 +59,10 @@ class Normalizer(nn.Module):
             getattr(self, name).copy_(torch.from_numpy(value))
 
     def take(self, statistics: Mapping[str, Tensor], feature: str, source: object) -> None:
-        """Take published statistics, name → (W,), of a feature such as "action".
+        """Use published statistics, name → (W,), of a feature such as "action".
 
         Raises:
-            UserError: they lack the feature, or are of another width.
+            UserError: they lack the feature, or have another width.
         """
         for name in self.statistics:
             own, found = getattr(self, name), statistics.get(f"{feature}.{name}")

@@ -1,6 +1,6 @@
-"""Linear maps of inference on a CPU, by oneDNN with weights in its own layout.
+"""Linear maps for inference on a CPU, computed by oneDNN with weights in its own layout.
 
-On processors of AMD this is more than twice as fast as what PyTorch calls by default, Intel's MKL, and rounds as well.
+On AMD processors this is more than twice as fast as Intel's MKL, PyTorch's default, and as accurate.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from transformers.models.siglip.modeling_siglip import SiglipMLP
 from transformers.models.smolvlm.modeling_smolvlm import SmolVLMVisionMLP
 
 Packed = tuple[tuple[int, int], Tensor]  # address and version of a weight, and the weight in another layout
-PACKED: WeakKeyDictionary[nn.Module, Packed] = WeakKeyDictionary()  # no part of modules, which are saved and copied
-# Fused optimisers do not tell by a weight's version that they change it.
+PACKED: WeakKeyDictionary[nn.Module, Packed] = WeakKeyDictionary()  # not in the modules, which are saved and copied
+# Fused optimisers change a weight without changing its version.
 register_optimizer_step_post_hook(lambda *_: PACKED.clear())
 
 
 class PackedLinear(nn.Linear):
-    """`nn.Linear` with the same parameters, which has its weight in another layout, too, once it acted in float32."""
+    """`nn.Linear` with the same parameters, which also caches its weight in oneDNN's layout for float32 inference."""
 
     def forward(self, input: Tensor) -> Tensor:
         """Map (…, inputs) to (…, outputs)."""
@@ -36,7 +36,7 @@ class PackedLinear(nn.Linear):
         return self._packed(input, "gelu", "tanh")
 
     def _plain(self, input: Tensor) -> bool:
-        if torch.compiler.is_compiling() or not torch.is_inference_mode_enabled():  # only the former can be traced
+        if torch.compiler.is_compiling() or not torch.is_inference_mode_enabled():  # the latter cannot be traced
             return True
         known = input.device.type == "cpu" and self.weight.dtype == torch.float32
         return not known or torch.is_autocast_enabled("cpu")
@@ -62,7 +62,7 @@ class PackedMLP(nn.Module):
 
 
 def pack(network: nn.Module) -> None:
-    """Let all linear maps in a network compute so, where PyTorch has oneDNN."""
+    """Convert the linear maps and image encoder MLPs of a network to packed ones, in place, if PyTorch has oneDNN."""
     if not torch.backends.mkldnn.is_available():
         return
     for module in network.modules():

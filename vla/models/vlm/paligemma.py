@@ -1,8 +1,8 @@
-"""PaliGemma with an expert for actions: a narrower Gemma whose layers attend to its keys and values too.
+"""PaliGemma with an action expert: a narrower Gemma whose layers attend to the keys and values of PaliGemma too.
 
 The trunk of π0 (K. Black et al., "π0: A Vision-Language-Action Flow Model for General Robot Control", arXiv 2410.24164)
 and of π0.5 (Physical Intelligence, "π0.5: a Vision-Language-Action Model with Open-World Generalization", arXiv
-2504.16054). Attention is by blocks: images and sentence see each other, and the actions see them and each other.
+2504.16054). Attention is block-wise: images and sentence attend to each other, actions to these and to each other.
 
 Shapes: B batch, C cameras, L tokens of the sentence, N tokens of any kind, P tokens of the prefix, k action chunk, A
 components of a padded action, E width of a token, H width of a head.
@@ -42,7 +42,7 @@ class GemmaLayer(WithKeys, GemmaDecoderLayer):
 class PaliGemmaWithExpert(FlowNetwork):
     """What π0 and π0.5 share: the trunk, the expert, and attention between them.
 
-    The heads share one key head, and every patch becomes a token.
+    All query heads share one key-value head, and every patch becomes a token.
     """
 
     published = tuple((f"{head}{there}", here) for head in HEADS for there, here in NAMES)
@@ -59,13 +59,13 @@ class PaliGemmaWithExpert(FlowNetwork):
         self.action_out_proj = nn.Linear(self.expert_width, self.action_width)
 
     def options(self) -> dict[str, Any]:
-        """Return LeRobot's options of this network, whose other sizes it does not let one choose."""
+        """Return LeRobot's options of this network; its other sizes are fixed in LeRobot."""
         return {"image_resolution": [self.resolution] * 2}
 
     def prefix(self, images: Tensor, cameras: Tensor, tokens: Tensor, sentence: Tensor, state: Tensor | None) -> Prefix:
-        """Encode images and sentence; what is absent is not seen, and positions do not count it."""
+        """Encode images and sentence; absent tokens are masked, and positions do not count them."""
         seen = self.paligemma.get_image_features(images.flatten(0, 1)).pooler_output.unflatten(0, images.shape[:2])
-        read = self.paligemma.language_model.embed_tokens(tokens)  # times the root of its width
+        read = self.paligemma.language_model.embed_tokens(tokens)  # which scales by the square root of its width
         present = torch.cat([cameras.repeat_interleave(seen.shape[2], 1), sentence], 1)
         hidden = torch.cat([seen.flatten(1, 2), read], 1)
         return self.attend(self.paligemma.language_model, hidden, present, None)[1]
@@ -73,13 +73,13 @@ class PaliGemmaWithExpert(FlowNetwork):
     def attend(
         self, gemma: GemmaModel, hidden: Tensor, present: Tensor, prefix: Prefix | None, **condition: Tensor
     ) -> tuple[Tensor, Prefix]:
-        """Pass tokens through the layers of a Gemma, in which they see each other and the prefix.
+        """Pass tokens through the layers of a Gemma, in which they attend to each other and to the prefix.
 
         Args:
             gemma: with layers like those of the trunk.
             hidden: (B, N, E).
             present: (B, N) bool, false for padding.
-            prefix: what else they see.
+            prefix: preceding tokens, to which they attend too; None: there are none.
             condition: further arguments of every layer.
 
         Returns:
@@ -111,8 +111,8 @@ def _trunk(text: dict[str, Any], vision: dict[str, Any]) -> PaliGemmaModel:
 
 
 def _expert(sizes: dict[str, int]) -> GemmaModel:
-    """Build the expert, whose input is no text."""
-    # Ids of the tokens of no text must be within its vocabulary, too.
+    """Build the expert, whose input is not text."""
+    # The ids of special tokens must be within the vocabulary even so.
     expert = GemmaModel(GemmaConfig(**sizes, vocab_size=1, pad_token_id=0, bos_token_id=0, eos_token_id=0))
     del expert.embed_tokens
     return_keys(expert, GemmaLayer)
@@ -120,7 +120,7 @@ def _expert(sizes: dict[str, int]) -> GemmaModel:
 
 
 def joined(first: Prefix, second: Prefix) -> Prefix:
-    """Return a prefix of both, the second behind the first."""
+    """Concatenate two prefixes."""
     keys, values = (
         tuple(torch.cat(pair, 2) for pair in zip(*both, strict=True))
         for both in ((first.keys, second.keys), (first.values, second.values))

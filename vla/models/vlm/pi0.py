@@ -1,4 +1,4 @@
-"""π0: PaliGemma with an expert for actions, and a token of the robot state between prefix and actions.
+"""π0: PaliGemma with an action expert, and a token of the robot state between images and sentence and the actions.
 
 Shapes: see `vla.models.vlm.paligemma`; also S padded state.
 """
@@ -31,7 +31,7 @@ class PI0(PaliGemmaWithExpert):
         self.action_time_mlp_out = nn.Linear(width, width)
 
     def prefix(self, images: Tensor, cameras: Tensor, tokens: Tensor, sentence: Tensor, state: Tensor | None) -> Prefix:
-        """Encode images and sentence, and then the state, in the expert: it sees them, but no actions."""
+        """Encode images and sentence, then the state in the expert, where it attends to them but not to actions."""
         assert state is not None
         known = super().prefix(images, cameras, tokens, sentence, None)
         token = self.state_proj(state).unsqueeze(1)
@@ -40,7 +40,7 @@ class PI0(PaliGemmaWithExpert):
     def velocity(self, prefix: Prefix, noisy: Tensor, time: Tensor) -> Tensor:
         """Predict the velocity of (B, k, A) noisy actions at times (B,) or (B, k)."""
         hidden = self.action_in_proj(noisy)
-        # The angles of the highest frequency differ by 1e-4 in this precision, in which transformers has them.
+        # In this precision, which transformers uses, the angles of the highest frequency are off by 1e-4.
         hidden = with_time(hidden, time.float(), (self.action_time_mlp_in, self.action_time_mlp_out), torch.float32)
         hidden, _ = self.attend(self.expert, hidden, prefix.present.new_ones(noisy.shape[:2]), prefix)
         return self.action_out_proj(self.expert.norm(hidden).float())

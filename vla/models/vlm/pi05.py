@@ -1,4 +1,4 @@
-"""π0.5: PaliGemma with an expert for actions, whose norms depend on the time; the sentence has the robot state.
+"""π0.5: PaliGemma with an action expert whose norms depend on the time; the robot state is part of the sentence.
 
 Shapes: see `vla.models.vlm.paligemma`.
 """
@@ -47,7 +47,7 @@ class PI05(PaliGemmaWithExpert):
 
 
 class AdaptiveNorm(nn.Module):
-    """Root-mean-square norm with scale and shift from a condition, which also gives the gate of what follows.
+    """RMS norm with scale and shift from a condition, which also gives a gate for the output of the next sublayer.
 
     All three are zero at first, so that a new layer changes nothing.
 
@@ -63,7 +63,7 @@ class AdaptiveNorm(nn.Module):
         self._init_weights(self.dense)
 
     def _init_weights(self, module: nn.Linear) -> None:
-        """Initialise as models of transformers do, which would give it other weights."""
+        """Initialise with zeros; this hook of transformers' models takes precedence over that of the whole expert."""
         nn.init.zeros_(module.weight)
         nn.init.zeros_(module.bias)
 
@@ -86,7 +86,7 @@ class AdaptiveLayer(nn.Module):
     def forward(
         self, hidden: Tensor, condition: Tensor, others: tuple[Tensor, Tensor] | None, **attention: Any
     ) -> Layered:
-        """Pass (B, N, E) tokens, given the condition of the norms, what else they see, and how they attend."""
+        """Process (B, N, E) tokens, given the condition of the norms, and keys and values of preceding tokens."""
         own = Own(others)
         normal, gate = self.input_layernorm(hidden, condition)
         hidden = hidden + self.self_attn(normal, past_key_values=own, **attention)[0] * gate

@@ -1,4 +1,4 @@
-"""Vision-language-action models: everything between an observation and a network, and between it and a robot.
+"""Vision-language-action models: everything between observation and network, and between network and actions.
 
 Flow matching runs from noise at time 1 to actions at time 0, as in K. Black et al., "π0: A Vision-Language-Action Flow
 Model for General Robot Control", arXiv 2410.24164.
@@ -40,7 +40,7 @@ Place = Literal["corner", "centre"]
 
 
 class VisionLanguageAction(Model):
-    """A pretrained network that sees all cameras, reads the sentence and the state, and moves noise to actions.
+    """A pretrained network that sees all cameras, reads the sentence and the state, and transports noise to actions.
 
     Images, sentence and state are encoded once per plan. Rates of change in the state are left out.
 
@@ -49,7 +49,7 @@ class VisionLanguageAction(Model):
         text: factory of its prompt.
         trunk: folder with pretrained weights, or their name on the hub, hub:OWNER/NAME or hub:OWNER/NAME@REVISION:
             those of the vision-language model alone, or of a whole policy of LeRobot; null: all weights are random.
-        cameras: what the pretrained policy calls a camera → the camera of the demonstrations, null for none; null: the
+        cameras: name of a camera in the pretrained policy → camera of the demonstrations, null for none; null: the
             cameras of the demonstrations in their order.
         chunk: k.
         execute: number of the k actions that a policy executes before it predicts again; null: all.
@@ -57,11 +57,11 @@ class VisionLanguageAction(Model):
         steps: Euler steps from noise to actions.
         copies: R, number of noisy copies of each chunk in a training batch, which share its prefix.
         normalization: of state and actions.
-        statistics: whose they are normalised by, those of the demonstrations or of the pretrained policy.
-        place: where images of another aspect ratio lie in the square of the network.
+        statistics: by which they are normalised: those of the demonstrations or of the pretrained policy.
+        place: where images of another aspect ratio are placed in the square input of the network.
         shift: largest random shift of the training images, vertical and horizontal [1/256 of the image height].
-        auxiliary: loss weight of the simulator's state, which a head predicts from what actions see of the last token
-            of the prefix, in training only; 0 omits it.
+        auxiliary: loss weight of the head that predicts the simulator's state from the values of the last token of the
+            prefix, in training only; 0 omits it.
 
     Raises:
         UserError: state or actions have too many components, a camera is unknown, the trunk does not fit, the
@@ -121,7 +121,7 @@ class VisionLanguageAction(Model):
         self.register_buffer("noise", noise, persistent=False)
 
     def fit(self, states: np.ndarray, actions: np.ndarray) -> None:
-        """Normalise by the statistics of (N, P) states and (N, D) actions, unless they are those of the trunk."""
+        """Normalise by the statistics of (N, P) states and (N, D) actions, unless those of the trunk are to be used."""
         if not (self.network.state_width or self.text.state):  # as openpi trains π0.5 on LIBERO
             text = "%s sees the state in the sentence only, and it is not there: model.text.state=true adds it"
             log.warning(text, type(self.network).__name__)
@@ -146,9 +146,9 @@ class VisionLanguageAction(Model):
         return 2 * x - 1
 
     def noised(self, batch: Batch) -> Batch:
-        """Return a batch with "noise", (R·B, k, A), "time" and "length" of the given prefix, (R·B,).
+        """Return a batch with "noise", (R·B, k, A), and "time" and "length" of the given actions, (R·B,) each.
 
-        Outside training they are always the same.
+        Outside training they have a fixed seed.
         """
         how, count = random_arguments(self.training, self.noise.device), self.copies * len(batch["state"])
         noise = torch.randn(count, *self.noise.shape, **how)
@@ -183,7 +183,7 @@ class VisionLanguageAction(Model):
     def action_loss(self, output: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
         """Return the mean squared error of the velocity of valid actions, without padding.
 
-        Where actions attend to later ones, and without a prefix, the repeated last action of an episode counts, too.
+        If actions attend to later ones and there is no prefix, repeated last actions of unperturbed chunks count too.
         """
         error = (output["velocity"] - output["target"])[..., : len(self.spec.action)].square().mean(-1)
         copies, ahead = len(error) // len(batch["valid"]), batch["perturbations"][:, -1]
@@ -196,7 +196,7 @@ class VisionLanguageAction(Model):
         return {"action_loss": mean_where(error, counted)}
 
     def predict(self, batch: Batch) -> Prediction:
-        """Move the "noise" of the batch, or else a fixed noise, to actions."""
+        """Transport the "noise" of the batch, or else a fixed noise, to actions."""
         prefix = self.known(batch)
         noise = batch["noise"] if "noise" in batch else self.noise.expand(len(prefix.present), -1, -1)
         velocity = self.continued(lambda x, progress: -self.network.velocity(prefix, x, 1 - progress), batch)
@@ -207,7 +207,7 @@ class VisionLanguageAction(Model):
 
 
 def last_of(known: Prefix) -> Tensor:
-    """Return what actions see of the last token of every prefix in the last layer, (B, C): padding may follow it."""
+    """Return the last layer's values of the last token, before any padding, of every prefix, (B, `value_width`)."""
     last = newest(known.present)
     return known.values[-1][torch.arange(len(last), device=last.device), :, last].flatten(1)
 
@@ -215,7 +215,7 @@ def last_of(known: Prefix) -> Tensor:
 def resize_with_padding(images: Tensor, size: int, place: Place) -> Tensor:
     """Resize (B, 3, H, W) float images to (B, 3, size, size), bilinear, with black borders for other aspect ratios.
 
-    They are not antialiased, as the pretrained policies have seen them: in the bottom right "corner", or the "centre".
+    There is no antialiasing, as in pretraining. Images are placed in the bottom right "corner" or in the "centre".
     """
     height, width = images.shape[2:]
     ratio = max(width / size, height / size)
@@ -226,7 +226,7 @@ def resize_with_padding(images: Tensor, size: int, place: Place) -> Tensor:
 
 
 def repeated(prefix: Prefix, copies: int) -> Prefix:
-    """Repeat the rows of a prefix."""
+    """Repeat the rows of a prefix `copies` times."""
     if copies == 1:
         return prefix
     keys, values = (tuple(part.repeat(copies, 1, 1, 1) for part in parts) for parts in (prefix.keys, prefix.values))

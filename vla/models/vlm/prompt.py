@@ -24,7 +24,7 @@ from vla.models.text.ngrams import TextEncoder, padding_last
 PADDING = -1
 FILE = "tokenizer.json"
 WORDS = 4096  # hashes of words, where no tokenizer is named
-STEP = 16  # tokens: few lengths, so that a program compiled for each can be kept
+STEP = 16  # lengths are multiples of it [tokens]: few, so that a program compiled for each can be kept
 BINS = 256  # of a normalised state in -1 … 1
 TRIED = "Task: pick it up, State: -1 0 255;\nAction: "
 
@@ -33,7 +33,7 @@ class Prompt(TextEncoder):
     """A sentence as a line of its own, cut to L tokens.
 
     With `state` it is "Task: SENTENCE, State: NUMBERS;\\nAction: ", as π0.5 has it: the numbers of bins of the state.
-    Their tokens are looked up and inserted where the state is, so that there is no text to read again at every plan.
+    Tokens of the numbers are looked up and inserted on the device of the state, so that no plan has to tokenize a text.
 
     Args:
         name: folder with the tokenizer.json of the language model, or its name on the hub, OWNER/NAME or
@@ -72,7 +72,7 @@ class Prompt(TextEncoder):
                 )
 
     def tokenize(self, sentences: list[str]) -> Tensor:
-        """Return (B, L) int64 tokens, `PADDING` after the end; L is that of the longest sentence, in steps of 16."""
+        """Return (B, L) int64 tokens, `PADDING` after the end; L is the longest sentence rounded up to `STEP`s."""
         texts = [
             f"Task: {_clean(each)}, State:" if self.state else each.removesuffix("\n") + "\n" for each in sentences
         ]
@@ -100,7 +100,7 @@ class Prompt(TextEncoder):
         return {"sha256": self._sha256}
 
     def set_extra_state(self, state: Any) -> None:
-        """Raise a UserError if the tokenizer is another than that of a training."""
+        """Raise a UserError if the tokenizer differs from the one in training."""
         trained = state.get("sha256") if isinstance(state, dict) else self._sha256
         if trained != self._sha256:
             raise UserError(f"the {FILE} of {self.name} is another than in training: its SHA-256 is not {trained}")

@@ -1,4 +1,4 @@
-"""SmolVLA: a small vision-language model and an expert beside it, layer by layer.
+"""SmolVLA: a small vision-language model, and an action expert that attends to it layer by layer.
 
 M. Shukor et al., "SmolVLA: A Vision-Language-Action Model for Affordable and Efficient Robotics", arXiv 2506.01844.
 
@@ -29,18 +29,18 @@ NO_TOKENS: dict[str, None] = {"bos_token_id": None, "eos_token_id": None}  # not
 
 
 class SmolVLA(FlowNetwork):
-    """The first layers of SmolVLM2 and an expert of equally many layers, which reads the keys and values of theirs.
+    """The first layers of SmolVLM2 and an action expert of equally many layers, which read their keys and values.
 
     In every layer whose number is a multiple of `joint_every`, actions attend to the prefix and causally to themselves;
     in the others to the prefix alone, through projections of its keys and values that are computed once per plan. In
     the prefix, images and sentence see each other, and the state, which comes last, sees all.
 
     Args:
-        key_heads: of the language model, each of which several heads share.
-        shuffle: so many by so many neighbouring patches become one token.
-        image: factory of an image encoder, conditioned on the sum of the words, for `keypoints`.
-        keypoints: tokens per image that take the place of the vision transformer's: from random weights that needs many
-            more images until it knows where things are; 0: none, as in published weights.
+        key_heads: number of key-value heads of the language model, each shared by several query heads.
+        shuffle: this many by this many neighbouring patches become one token.
+        image: factory of an image encoder, conditioned on the sum of the word embeddings, for `keypoints`.
+        keypoints: number of keypoint tokens per image, in place of those of the vision transformer, which from random
+            weights needs many more images until it locates objects; 0: none, as in published weights.
         joint_every: 1: no layer attends to the prefix alone.
         state_width: S.
 
@@ -80,7 +80,7 @@ class SmolVLA(FlowNetwork):
             if image is None:
                 raise UserError(f"model.network.keypoints={keypoints} need an image encoder, model.network.image")
             self.keypoints = KeypointTokens(image, keypoints, self.width)
-            nn.init.normal_(self.vlm.text_model.embed_tokens.weight, std=self.width**-0.5)  # as large as keypoints
+            nn.init.normal_(self.vlm.text_model.embed_tokens.weight, std=self.width**-0.5)  # scale of keypoint tokens
             del self.vlm.vision_model, self.vlm.connector
         self.expert = _expert(shared, joint_every, **self.of_expert)
         self.state_proj = nn.Linear(state_width, self.width)
@@ -90,10 +90,10 @@ class SmolVLA(FlowNetwork):
         self.action_time_mlp_out = nn.Linear(self.expert_width, self.expert_width)
 
     def options(self) -> dict[str, Any]:
-        """Return LeRobot's options of this network; the width of the expert is a factor of that of the trunk.
+        """Return LeRobot's options of this network, with the width of the expert as a multiple of the trunk's.
 
         Raises:
-            UserError: it sees keypoints, and LeRobot's does not.
+            UserError: the network has keypoint tokens, which LeRobot's lacks.
         """
         if self.keypoints is not None:
             raise UserError("LeRobot's SmolVLA sees no keypoints: train with model.network.keypoints=0")
@@ -179,15 +179,15 @@ class ExpertLayer(LlamaDecoderLayer):
     """A layer of the expert."""
 
     def forward(self, hidden_states: Tensor | None, prefix: tuple[Tensor, Tensor], **attention: Any) -> Any:
-        """Return (B, k, F) tokens; or given none, what they are to attend to of the prefix: FSDP gathers the weights
-        of a layer for its `forward` only."""
+        """Process (B, k, F) tokens; without tokens, return the keys and values of the prefix that they will attend to,
+        here because FSDP gathers the weights of a layer for its `forward` only."""
         if hidden_states is None:
             return self.self_attn.read(*prefix)
         return super().forward(hidden_states, prefix=prefix, **attention)
 
 
 class ExpertAttention(LlamaAttention):
-    """Attention of actions to the prefix, and if it is `joint` to themselves, which have keys and values then."""
+    """Attention of actions to the prefix and, if `joint`, to each other, by keys and values of their own."""
 
     def __init__(self, config: LlamaConfig, layer: int, *, joint: bool) -> None:
         super().__init__(config, layer)
@@ -231,8 +231,8 @@ def _trunk(text: dict[str, Any], vision: dict[str, Any], shuffle: int) -> SmolVL
 
 
 def _expert(shared: dict[str, Any], joint_every: int, hidden_size: int, intermediate_size: int) -> LlamaModel:
-    """Build the expert, whose input is no text."""
-    # Heads need not fill its width, which the check of its configuration demands.
+    """Build the expert, whose input is not text."""
+    # The heads need not add up to its width, though the validation of `LlamaConfig` demands it.
     config = LlamaConfig(**shared, vocab_size=1, **sizes(shared["num_attention_heads"], intermediate_size))
     config.hidden_size = hidden_size
     expert = LlamaModel(config)

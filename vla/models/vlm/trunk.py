@@ -1,4 +1,4 @@
-"""Pretrained weights that lie elsewhere: of a vision-language model, or of a whole policy of LeRobot."""
+"""Pretrained weights that are stored elsewhere: of a vision-language model, or of a whole policy of LeRobot."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from vla.parallel.limits import free_memory
 Part = TypeVar("Part")
 
 PREPROCESSOR = "policy_preprocessor.json"
-NORMALIZER = "normalizer_processor"  # its step
+NORMALIZER = "normalizer_processor"  # its step that normalises
 IMAGES = "observation.images."
 KINDS = ("smolvla", "pi0", "pi05")  # of policies of LeRobot
-# Options of LeRobot's policies that change what is computed → the values that are known here. With 0 layers or less the
-# expert has those of the trunk, and with a length of 0 or less a prefix is not padded: smolvla_base has 0 for both.
+# Options of LeRobot's policies that change what is computed → values that are supported here. With 0 layers or less the
+# expert has as many as the trunk, and with a length of 0 or less a prefix is not padded: smolvla_base has 0 for both.
 OPTIONS: dict[str, tuple[Any, ...]] = {
     **{"adapt_to_pi_aloha": (False,), "add_image_special_tokens": (False,), "attention_mode": ("cross_attn",)},
     **{"num_expert_layers": (-1, 0), "prefix_length": (-1, 0), "use_relative_actions": (False,)},
@@ -36,13 +36,13 @@ OPTIONS: dict[str, tuple[Any, ...]] = {
 
 
 class Trunk:
-    """The folder of pretrained weights; they are read when a network is built.
+    """A folder of pretrained weights, which are read when a network is built.
 
     Args:
         name: a folder, or hub:OWNER/NAME or hub:OWNER/NAME@REVISION.
 
     Raises:
-        UserError: there is none, it cannot be fetched, or its policy has options that are unknown here.
+        UserError: there is none, it cannot be fetched, it has no weights, or its policy has unsupported options.
     """
 
     def __init__(self, name: str) -> None:
@@ -81,7 +81,7 @@ class Trunk:
         return [name.removeprefix(IMAGES) for name, each in features.items() if each.get("type") == "VISUAL"]
 
     def statistics(self, kind: Kind) -> dict[str, Tensor]:
-        """Return those of the normaliser of the policy, such as action.mean; none if it has no normaliser.
+        """Return the statistics by which the policy normalises, such as action.mean; empty if it has no normaliser.
 
         Raises:
             UserError: it normalises in another way than `kind`.
@@ -101,13 +101,13 @@ class Trunk:
         return {name: tensor for path in paths if path.is_file() for name, tensor in _tensors([path])}
 
     def _of(self, key: str, kind: type[Part]) -> Part:
-        """Return a mapping of the config, which may lack it."""
+        """Return a mapping in the config; an empty one if it is missing."""
         return parse_plain(self._config.get(key) or {}, kind, f"{key} of {self.folder / CONFIG}")
 
     def build(self, network: Callable[[], FlowNetwork]) -> FlowNetwork:
-        """Build a network with these weights; what a vision-language model has no weights for is random.
+        """Build a network with these weights; parts that a vision-language model lacks are initialised at random.
 
-        Parts whose weights are all from here have their `source` as an attribute.
+        Modules all of whose weights were read from here get the attribute `source`.
 
         Raises:
             UserError: a weight is missing, unknown or of another shape, or they need more memory than is free.
@@ -143,7 +143,7 @@ class Trunk:
 
 
 def sketch(network: Callable[[], FlowNetwork]) -> FlowNetwork:
-    """Build a network without values, on the device "meta"; a UserError if its weights need more than is free."""
+    """Build a network without values, on the device "meta"; a UserError if its weights exceed the free memory."""
     # Warnings of an image encoder's own weights, of which a sketch takes the shapes only.
     with torch.device("meta"), warnings.catch_warnings(action="ignore"):
         built = network()
@@ -157,10 +157,10 @@ def sketch(network: Callable[[], FlowNetwork]) -> FlowNetwork:
 
 
 def materialize(network: nn.Module) -> None:
-    """Give all tensors on the device "meta" memory, and the values of an untrained network."""
+    """Allocate all tensors that are on the device "meta", with the values of an untrained network."""
     for weight in network.parameters():
         marked: Any = weight
-        marked._is_hf_initialized = not weight.is_meta  # transformers leaves those alone that are
+        marked._is_hf_initialized = not weight.is_meta  # transformers does not initialise marked weights
     for name, module in network.named_modules():
         own = [*module.named_parameters(recurse=False), *module.named_buffers(recurse=False)]
         if not any(tensor.is_meta for _, tensor in own):
@@ -184,7 +184,7 @@ def _initialize(network: nn.Module, name: str, module: nn.Module) -> None:
 
 
 def _tensors(paths: list[Path]) -> Iterator[tuple[str, Tensor]]:
-    """Yield name and tensor of all that the files have; a UserError if one is damaged."""
+    """Yield the name and the tensor of every weight in the files; a UserError if a file is damaged."""
     for path in paths:
         with opened(path) as file:
             names: list[str] = file.keys()  # it is no mapping
