@@ -34,7 +34,7 @@ from vla.io.errors import UserError, suggestion
 from vla.io.printable import printable
 from vla.parallel.processes import ease_garbage_collection, spin_briefly, without_triton
 
-log = logging.getLogger("vla.run")  # also where this module is the program
+log = logging.getLogger("vla.run")  # also if this module is __main__
 
 SWEEP = "in the sweep "  # prefix of a note on a cell's error
 PICKLE = "--experimental-rerun"  # option of Hydra
@@ -98,14 +98,14 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
 
 def _is_mendable(error: Exception) -> bool:
     """Return whether `error` is about the command line, a file or the machine rather than a bug."""
-    # Lightning's, by name because importing it takes seconds; OmegaConf lets that of a list's key "x" through.
+    # Lightning's by name, because its import takes seconds; OmegaConf lets the ValueError of a list's key "x" through.
     lightning = type(error).__name__ == "MisconfigurationException"
     of_list = Path(traceback.extract_tb(error.__traceback__)[-1].filename).name == "omegaconf.py"
     return isinstance(error, MENDABLE) or lightning or of_list
 
 
 def _require_sweepable(experiment: Experiment, groups: Container[str]) -> None:
-    """Refuse grids of which only one cell would run, cells that share a folder, and cells on several devices."""
+    """Refuse a grid without -m or beside another grid, cells that share a folder, and cells on several devices."""
     config = HydraConfig.get()
     given = {key: value for key, _, value in (override.partition("=") for override in config.overrides.task)}
     name, params = config.runtime.choices["experiment"], config.sweeper.params or {}
@@ -128,10 +128,7 @@ def _require_sweepable(experiment: Experiment, groups: Container[str]) -> None:
 
 @contextmanager
 def _without_empty_folders(cfg: DictConfig) -> Iterator[None]:
-    """Remove the folder that Hydra created for this run, and `output` if it is new, if nothing is in them at the end.
-
-    Files of Hydra count as nothing.
-    """
+    """Remove the folder that Hydra created for this run, and a new `output`, if they end with no files but Hydra's."""
     folder, output = Path(HydraConfig.get().runtime.output_dir), Path(str(cfg.output))
     created = [output] if not output.exists() else []
     if HydraConfig.get().mode == RunMode.RUN and folder.resolve() != Path.cwd():
@@ -164,7 +161,7 @@ def _do(cfg: DictConfig) -> float | None:
 
 
 def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
-    """Return `cfg` merged with the run, policy or pretrained weights that it names; a UserError if it cannot be."""
+    """Return `cfg` merged with the run, policy or pretrained weights that it names; raise a UserError if impossible."""
     for key in ("resume", "checkpoint", "pretrained", "output"):
         if not isinstance(cfg[key], str | None) or (key == "output" and not cfg[key]):
             raise UserError(f"{key}={cfg[key]} is not a path: give a folder or file; a number is quoted, {key}=\\'3\\'")
@@ -198,7 +195,7 @@ def _fail(error: Exception) -> NoReturn:
 
 
 def _end(error: Exception) -> NoReturn:
-    """End the program: in one sentence, unless the error is a bug or the user wants its traceback."""
+    """End the program with an error of one sentence, unless it is a bug or the user wants its traceback."""
     for note in getattr(error, "__notes__", ()):
         if note.startswith(SWEEP):
             from vla.io.files import warn_on_error
@@ -217,9 +214,9 @@ def _end(error: Exception) -> NoReturn:
 
 
 def _say_how_to_continue(cfg: DictConfig) -> None:
-    """Log which command goes on after an interruption; without `output=` or `resume=` every command has a new folder.
+    """Log which command continues after an interruption: without `output=` or `resume=` a command gets a new folder.
 
-    Cells of a sweep say nothing: they may be many, each in a process of its own.
+    Cells of a sweep log nothing: there may be many, each in a process of its own.
     """
     if HydraConfig.get().mode == RunMode.RUN and cfg.job in CONTINUED:
         overrides = HydraConfig.get().overrides
@@ -244,8 +241,8 @@ def _compose(cfg: DictConfig) -> float | None:
 
 
 def _require_plain(arguments: list[str]) -> None:
-    """Refuse what Hydra's parser would answer with its usage, or a traceback, and its option that takes a config from a
-    pickle, which may run anything; options can be abbreviated."""
+    """Refuse arguments that Hydra would answer with its usage message or a traceback, and its option that loads a
+    config from a pickle, which may execute any code; options can be abbreviated."""
     if {"-m", "--multirun"} & {*arguments} and any(each.partition("=")[0] in ("-c", "--cfg") for each in arguments):
         raise UserError("--cfg shows the config of one run: leave out -m, and give every key one value")
     if "--resolve" in arguments and not any(each.startswith(("-c", "--cfg", "-h", "--help")) for each in arguments):
@@ -258,7 +255,7 @@ def _require_plain(arguments: list[str]) -> None:
 
 
 def _require_options(arguments: list[str]) -> None:
-    """Refuse values where groups take names of options, and a command without a job, which are tracebacks of Hydra."""
+    """Refuse arguments at which Hydra shows a traceback, such as a value where a group takes an option, or no job."""
     for argument in arguments:
         name, equals, value = argument.partition("=")
         group = name.lstrip("+~").partition("@")[0]
@@ -277,7 +274,7 @@ def _require_options(arguments: list[str]) -> None:
 
 
 def _require_ranks() -> None:
-    """Refuse numbers of processes in the environment that are none."""
+    """Refuse environment variables of process ranks that are not numbers."""
     for name, value in ((name, os.environ.get(name, "0")) for name in RANKS):
         if not value.isdecimal():
             raise UserError(f"the environment variable {name} is {value[:50]!r}, not the number of a process: unset it")

@@ -1,1 +1,1 @@
-"""Configs: checked, adopted and built. Besides, only `run.py` and the callback of sweeps use hydra and omegaconf."""
+"""Config validation, merging and construction; elsewhere only `run.py` and `jobs/sweep.py` use Hydra or OmegaConf."""

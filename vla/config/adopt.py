@@ -1,7 +1,7 @@
-"""Merge of a composed config with the policy or run that it names.
+"""Merging of a composed config with the policy or run that it names.
 
-`checkpoint=RUN` takes task, tokenizer and model from a policy, `pretrained=RUN` tokenizer, model and data for a new
-training (with job=improve also task, expert and learner), `resume=RUN` all of a run; overrides apply on top.
+`checkpoint=RUN` takes task, tokenizer and model from a policy, `pretrained=RUN` takes tokenizer, model and data for a
+new training (with job=improve also task, expert and learner), `resume=RUN` takes all of a run. Overrides go on top.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from vla.models.trunk_folder import is_trunk
 log = logging.getLogger(__name__)
 
 LAST = Path("checkpoints/last.ckpt")  # in the folder of a training
-# How a policy was trained, beside task, tokenizer and model: what rounds continue, and what a report on it shows.
+# How a policy was trained, besides task, tokenizer and model: rounds of DAgger keep these, and reports show them.
 OF_TRAINING = ("expert", "data", "learner", "validate", "collect.episodes", "collect.seed")
 SCHEDULE = ("val_check_interval", "accumulate_grad_batches", "gradient_clip_val", "precision")  # of the trainer
 REPORTED = (*OF_TRAINING, "seed", "trainer.max_steps", *(f"trainer.{name}" for name in SCHEDULE))
 OVER = ("seed", "data", "learner", "trainer", "logger", "validate")  # keys that do not change a trained policy
 MACHINES = ("accelerator", "devices", "num_nodes", "strategy")  # keys that trainer=OPTION changes in a resumed run
-# With other values of these keys a resumed run is another training.
+# A resumed run with other values of these keys would be a different training.
 IDENTITY = (
     *(group.name for group in GROUPS.values() if group.training == "part"),
     *("collect.episodes", "collect.seed", "collect.folder", "collect.more", "validate", "seed", "pretrained"),
@@ -44,8 +44,8 @@ IDENTITY = (
 def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Return `cfg` with task, tokenizer and model of `cfg.checkpoint`; for job=evaluate also its training settings.
 
-    A path or address in these nodes is an error; in the training settings, which are only shown, it becomes null. There
-    is a UserError if there is no such policy, or an override contradicts its weights.
+    A path or address in these three nodes is an error; in the saved expert it becomes null. Raises a UserError if there
+    is no such policy, or an override contradicts its weights.
     """
     parsed = _parsed(overrides, ("tokenizer", "model", "experiment"))
     saved = read_policy(cfg.checkpoint).config
@@ -57,17 +57,17 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
             log.warning(text, ", ".join(str(each.input_line) for each in over))
         parsed = [each for each in parsed if each not in over]  # a report shows the training as it was
         values |= _values(saved, REPORTED)
-        # Only an open-loop evaluation builds one of them.
+        # The only one of them that is ever built, in an open-loop evaluation.
         values |= {"expert": without_paths(saved, "expert")} if "expert" in saved else {}
     return _on_top(cfg, values | _chosen(saved, "experiment", "model"), parsed)
 
 
 def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
-    """Return `cfg` with tokenizer, model and data of the policy `cfg.pretrained`, the initial weights of a training.
+    """Return `cfg` with tokenizer, model and data of the policy `cfg.pretrained`, whose weights initialise a training.
 
-    Rounds with the expert continue the training of that policy: job=improve also takes task, expert, learner,
-    validation, and number and seed of the demonstrations. There is a UserError if there is no such policy, the job does
-    not train, or an override contradicts the weights.
+    Rounds of DAgger continue the training of that policy: job=improve also takes task, expert, learner, validation, and
+    number and seed of the demonstrations. Raises a UserError if there is no such policy, the job does not train, or an
+    override contradicts the weights.
     """
     if cfg.checkpoint is not None or cfg.job not in ("train", "evaluate", "improve"):
         raise UserError(
@@ -76,18 +76,18 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
         )
     if is_trunk(cfg.pretrained):
         return _with_trunk(cfg)
-    saved, improved = read_policy(cfg.pretrained).config, cfg.job == "improve"  # first: a wrong path is said as such
+    saved, improved = read_policy(cfg.pretrained).config, cfg.job == "improve"  # first, to report a wrong path
     parsed = _parsed(overrides, ("tokenizer", "model", "experiment"))
     parts = (*REQUIRED_NODES, *OF_TRAINING) if improved else ("tokenizer", "model", "data")
     require_no_paths(saved, parts, cfg.pretrained, _given(parsed) if improved else None)
     values = _values(saved, parts)
     if "seed" in values.get("data", {}):
-        values["data"] = {**values["data"], "seed": "${seed}"}  # of this training: it orders the windows
+        values["data"] = {**values["data"], "seed": "${seed}"}  # of the new training: it orders the windows
     return _on_top(cfg, values | _chosen(saved, "model"), parsed)
 
 
 def _with_trunk(cfg: DictConfig) -> DictConfig:
-    """Return `cfg` with the weights of a policy or a vision-language model that others published as `model.trunk`.
+    """Return `cfg` with the published policy or vision-language model `cfg.pretrained` as its `model.trunk`.
 
     Raises:
         UserError: the chosen model has no trunk.
@@ -104,8 +104,8 @@ def _with_trunk(cfg: DictConfig) -> DictConfig:
 def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     """Return the config of `run`, to continue it in its folder.
 
-    The command line overrides the saved config. From an option of `trainer` only the keys in `MACHINES` are taken; a
-    change of a key in `IDENTITY` is refused by `require_identity` when training starts. There is a UserError if the
+    The command line overrides the saved config. Of a `trainer` option that it chooses, only the keys in `MACHINES` are
+    taken. `require_identity` refuses a change of a key in `IDENTITY` when training starts. Raises a UserError if the
     folder has no training, is not one of the user's own runs, or `cfg` names another policy.
     """
     if cfg.checkpoint is not None or cfg.pretrained is not None:
@@ -135,7 +135,7 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
 
 
 def _saved(run: Path) -> tuple[Path, Mapping[str, Any]]:
-    """Return the config of a run and the file that has it: its last checkpoint, or config.yaml of one in rounds."""
+    """Return the file with the config of a run, its last checkpoint or config.yaml for rounds, and that config."""
     if (run / LAST).is_file():
         return run / LAST, read_header(run / LAST).config
     file = run / "config.yaml"
@@ -145,7 +145,7 @@ def _saved(run: Path) -> tuple[Path, Mapping[str, Any]]:
 
 
 def _values(saved: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
-    """Return the saved values at dotted keys, as far as there are any."""
+    """Return dotted key → saved value, without keys that the saved config lacks."""
     return {key: value for key in keys if (value := at(saved, key)) != ABSENT}
 
 
@@ -160,7 +160,7 @@ def require_identity(
 
     The dotted keys of `IDENTITY`, and `further` ones, must have equal values.
     """
-    standard = {"trainer.num_nodes": 1}  # which not all trainers name
+    standard = {"trainer.num_nodes": 1}  # the default of trainers that omit it
     before, now = ({key: at(each, key, standard.get(key)) for key in (*IDENTITY, *further)} for each in (saved, config))
     changed = [key for key, _, _ in differences(before, now)]
     if changed:
@@ -173,7 +173,7 @@ def require_identity(
 
 
 def _parsed(overrides: Sequence[str], fixed: Sequence[str]) -> list[Override]:
-    """Parse overrides; raise a UserError if one is of the groups that are `fixed` by the weights."""
+    """Parse overrides; raise a UserError if one changes a group that is `fixed` by the weights."""
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     for override in parsed:
         group = _path(override).partition(".")[0]
@@ -190,12 +190,12 @@ def _given(parsed: Iterable[Override]) -> list[str]:
 
 
 def _replaces(override: Override) -> bool:
-    """Return whether an override gives a whole value; Hydra merges mappings with what is there."""
+    """Return whether an override replaces a whole value; Hydra merges a mapping into the existing one instead."""
     return not override.is_delete() and not isinstance(override.value(), dict)
 
 
 def _path(override: Override) -> str:
-    """Return the dotted path that an override changes: its package, as in group@package=option, or that of its key."""
+    """Return the dotted path that an override changes: its package, as in group@package=option, or else its key."""
     package = override.package
     return package if package and not package.startswith("_") else override.key_or_group.replace("/", ".")
 

@@ -50,7 +50,7 @@ class MissingLibrary(UserError):
 
 
 def locate(key: str, target: Any) -> type:
-    """Import the class that the `_target_` at `key` names; a UserError if it is not allowed or does not exist."""
+    """Import the class that the `_target_` at `key` names; raise a UserError if it is not allowed or does not exist."""
     require_trusted(key, target)
     if not isinstance(target, str) or not (target.startswith(OWN) or target in LIBRARY or is_trusted(target)):
         raise UserError(
@@ -74,13 +74,13 @@ def locate(key: str, target: Any) -> type:
 
 
 def how_to_install(module: str) -> str:
-    """Return how to install the extra of this package that a module belongs to, if it belongs to one."""
+    """Return a hint on how to install the extra of this package that provides a module; "" if none does."""
     try:
         requirements = requires("vla") or []
-    except PackageNotFoundError:  # it runs from its folder
+    except PackageNotFoundError:  # run from a folder without installation
         return ""
     pattern = rf"{re.escape(module.partition('.')[0])}\b.*extra == '(\w+)'"
-    # In alphabetical order: of those with transformers, vlm is what the classes that import it with themselves need.
+    # The last match counts, in alphabetical order: of the extras with transformers that is vlm, which suffices for all.
     *_, extra = ["", *(found[1] for each in requirements if (found := re.match(pattern, each)))]
     return f"; install this package with its extra {extra}: pip install -e '.[{extra}]'" if extra else ""
 
@@ -88,7 +88,7 @@ def how_to_install(module: str) -> str:
 def require_trusted(source: object, target: Any, imported: bool = False) -> None:
     """Raise a UserError if `target`, named by `source`, belongs to a package that can be trusted but is not.
 
-    `imported`: it is the name of a package itself.
+    `imported`: `target` is itself the name of a package to import.
     """
     if not isinstance(target, str) or target.startswith(OWN) or target in LIBRARY or is_trusted(target):
         return
@@ -108,7 +108,7 @@ def targets(value: Any) -> list[Any]:
 
 
 def packages(value: Any) -> list[Any]:
-    """Return every package that a node in a plain value has imported: its argument `package`."""
+    """Return the argument `package` of every node in a plain value, the name of a package that the node imports."""
     return [part["package"] for part in mappings(value) if is_node(part) and "package" in part]
 
 
@@ -131,14 +131,14 @@ def takes_path(annotation: Any) -> bool:
 
 
 def mismatch(key: str, value: Any, annotation: Any) -> str:
-    """Say what is wrong with a plain value at `key`, with checked nodes in place of objects; "" if nothing is."""
+    """Describe how a plain value at `key`, with checked nodes in place of objects, violates its annotation; or ""."""
     try:
         _adapter(annotation).validate_json(json.dumps(value), strict=True)
     except ValidationError as error:
         errors = error.errors(include_url=False, include_context=False)
     else:
         return ""
-    # Members of a union fail in different depths: the deepest tells most.
+    # Members of a union fail at different depths: the deepest error is the most specific.
     path, part = max((_within(value, each["loc"]) for each in errors), key=lambda within: len(within[0]))
     reasons = dict.fromkeys(each["msg"] for each in errors if _within(value, each["loc"])[0] == path)
     words = [re.sub(r"^\w+ should (be )?| after validation.*", "", each).replace("None", "null") for each in reasons]

@@ -40,7 +40,7 @@ from vla.io.errors import UserError, suggestion
 from vla.io.types import Count, Inherited, Natural, NonNegative, Share
 
 HYDRA_KEYS = ("_target_", "_partial_")
-ADDRESSES = ("url", "uri", "host", "address", "api_key")  # arguments that say whom to connect with, and with which key
+ADDRESSES = ("url", "uri", "host", "address", "api_key")  # arguments that name a server or its key
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class Group:
     runtime: tuple[str, ...] = ()  # constructor arguments from the program, never from YAML
     optional: bool = False  # jobs run without it
     several: bool = False  # an option is a mapping of name → node
-    plain: bool = False  # nodes among its arguments are not built with it
-    training: Literal["", "part", "means"] = ""  # used in trainings: parts determine their result
+    plain: bool = False  # nodes among its arguments stay plain
+    training: Literal["", "part", "means"] = ""  # used in training: a "part" determines its result
 
 
 DEMONSTRATIONS = "vla.data.formats.imported_demonstrations.ImportedDemonstrations"
@@ -114,12 +114,12 @@ NARROWER: dict[str, dict[str, Any]] = {
 
 
 def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
-    """Build the object that a plain `node` of a group, or of its name in `GROUPS`, describes.
+    """Build the object that a plain `node` of a group, given itself or by its name in `GROUPS`, describes.
 
-    Nested nodes are built first; those with `_partial_: true` become factories; `runtime` is from the program.
-    Unresolved references such as `${seed}` are refused, so the checked mapping is the one that is built. There is a
-    UserError for a class that is not allowed or of another kind, wrong arguments, an error of the constructor, or a
-    library that it imports and that is not installed.
+    Nested nodes are built first; those with `_partial_: true` become factories. `runtime` are the arguments that the
+    program adds. Unresolved references such as `${seed}` are refused, so the checked mapping is the one that is built.
+    Raises a UserError for a class that is not allowed or of another kind, wrong arguments, a ValueError of the
+    constructor, or a library that is not installed.
     """
     group = GROUPS[group] if isinstance(group, str) else group
     node = resolved(node, group.name)
@@ -127,7 +127,7 @@ def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
     try:
         return instantiate(node, _convert_="all", _partial_=True, _recursive_=not group.plain)(**runtime)
     except (InstantiationException, ModuleNotFoundError) as error:
-        cause = error.__cause__ if isinstance(error, InstantiationException) else error  # of a node within, or of this
+        cause = error.__cause__ if isinstance(error, InstantiationException) else error  # in a nested node, or this one
         if isinstance(cause, ModuleNotFoundError):
             hint = how_to_install(str(cause.name))
             raise UserError(f"{group.name} needs a library that is not installed: {cause}{hint}") from error
@@ -146,9 +146,9 @@ def makes(group: Group) -> Any:
 def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) -> None:
     """Check a plain node at `key` against the signature of its class, without the `runtime` arguments.
 
-    A factory, a node with `_partial_: true`, lacks the arguments that its caller gives: keyword-only ones, and those
-    that programs give to a group. It belongs within another node only. There is a UserError if the class is no
-    `expected`, or a key is unknown, missing or ill-typed; with its dotted name and the allowed values.
+    A factory, a node with `_partial_: true`, may lack the arguments that its caller adds: keyword-only ones, and the
+    runtime arguments of groups. It is allowed inside another node only. Raises a UserError if the class is not an
+    `expected` one, or a key is unknown, missing or ill-typed, with its dotted name and the allowed values.
     """
     if not is_node(node):
         raise UserError(f"{key} must be a node with a _target_, got {short(node)}")
@@ -208,9 +208,9 @@ def require_no_paths(
     """Raise a UserError if a node of the file `source` names a file, a folder, or an address or key of a connection.
 
     Args:
-        config: plain, with the nodes `names`, as far as there are any, whose classes must be trusted.
-        source: for the error.
-        given: dotted names of nodes that the command line gives in place of the file's; None: it cannot.
+        config: plain; the classes of its nodes `names`, where present, must be trusted.
+        source: named in the error.
+        given: dotted names of nodes that the command line replaces; None: it cannot replace any.
     """
     require_trust(config, names, source)
     for key in (f"{path}.{argument}" for name in names for _, path, argument in _paths_in(config.get(name), name)):
@@ -223,9 +223,9 @@ def require_no_paths(
 
 
 def without_paths(config: Mapping[str, Any], name: str) -> Any:
-    """Return the node `name` of a config out of a file with null in place of the paths and addresses that it names.
+    """Return the node `name` of a config that was read from a file, with null in place of its paths and addresses.
 
-    Of a class that may not be built only the name is returned.
+    If it has a class that may not be built, only its own `_target_` is returned.
     """
     node = resolved(config[name], name)  # a copy
     try:
@@ -238,7 +238,7 @@ def without_paths(config: Mapping[str, Any], name: str) -> Any:
 
 
 def _paths_in(node: Any, key: str) -> Iterator[tuple[dict[str, Any], str, str]]:
-    """Yield what names a file, a folder or an address in a node at `key`: the part, its dotted name, the argument.
+    """Yield (part, its dotted name, argument) for every argument of a node at `key` that is a path or an address.
 
     A class that this machine cannot import yields no paths, because jobs that build it fail in any case.
     """
@@ -255,7 +255,7 @@ def _paths_in(node: Any, key: str) -> Iterator[tuple[dict[str, Any], str, str]]:
 
 
 def _parts(value: Any) -> Iterable[tuple[Any, Any]]:
-    """Return key and value of what is in a mapping or list."""
+    """Return (key or index, item) for the items of a mapping or list; nothing for other values."""
     return value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
 
 
@@ -276,7 +276,7 @@ def _check_nodes(key: str, value: Any) -> None:
 
 
 def require_known(key: str, name: str, known: Collection[str], owner: str) -> None:
-    """Raise a UserError for a name that `owner` does not take, with the one that was meant, or all that there are."""
+    """Raise a UserError for a name that `owner` does not take; it suggests a similar name, or lists all."""
     if name not in known:
         hint = suggestion(name, known) or f": {owner} takes {', '.join(known) or 'no arguments'}"
         raise UserError(f"{f'{key}.' if key else ''}{name} is unknown{hint}")
@@ -300,7 +300,7 @@ def arguments(target: type) -> dict[str, inspect.Parameter]:
 def _parameters(target: type) -> Mapping[str, inspect.Parameter]:
     """Return the arguments of a class's own constructor without `self`."""
     init: Any = vars(target)["__init__"]
-    # The constructor of a dataclass also has the annotations of its base classes, of other modules.
+    # The constructor of a dataclass also has annotations from the modules of its base classes.
     bases = (vars(sys.modules[base.__module__]) for base in target.__mro__[:-1])
     scope = ChainMap(inspect.unwrap(init).__globals__, *bases)
     found = {}

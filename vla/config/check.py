@@ -27,14 +27,14 @@ NEEDED = {"trainer": ("max_steps", "precision", "accumulate_grad_batches", "val_
 class Job:
     """Requirements of a job: only what it builds is checked and imported."""
 
-    groups: tuple[str | Group, ...]  # that it builds from; names in `GROUPS`, and others of its own
+    groups: tuple[str | Group, ...]  # that it builds: names in `GROUPS`, or groups of its own
     adopts: bool = False  # takes checkpoint=RUN
     without_agent: tuple[str, ...] = ()  # groups also needed without agent=OPTION
     without_checkpoint: tuple[str, ...] = ()  # groups also needed without agent=OPTION and checkpoint=RUN
     stored: tuple[str, ...] = ()  # groups whose libraries may be missing: a complete episode store takes their place
 
     def needs(self, config: Mapping[str, Any]) -> dict[str, Group]:
-        """Return name → group of everything that it builds from with a config."""
+        """Return name → group for every group that the job builds from a config."""
         names = [*self.groups]
         if config.get("agent") is None:
             names += self.without_agent
@@ -47,8 +47,8 @@ class Job:
 def check(experiment: Experiment, job: Job) -> None:
     """Check every node of an experiment that its `job` will build against the signature of its class.
 
-    There is a UserError for an unknown, missing or ill-typed key, with its dotted name and the allowed values; it says
-    so if the value is one that the chosen experiment sets.
+    Raises a UserError for an unknown, missing or ill-typed key, with its dotted name and the allowed values; the error
+    also says if the chosen experiment sets that value.
     """
     try:
         _check(experiment, job)
@@ -97,9 +97,9 @@ def _check(experiment: Experiment, job: Job) -> None:
 
 
 def _of_experiment(config: Mapping[str, Any], error: str) -> str:
-    """Say how to undo what the chosen experiment sets at the key that an error begins with; "" if it does not."""
+    """Return how to override the chosen experiment at the key that an error begins with; "" if it does not set that."""
     name, key = at(config, "chosen.experiment"), error.partition(" ")[0]
-    if "." not in key or config.get("checkpoint") is not None:  # which brings that of its own training
+    if "." not in key or config.get("checkpoint") is not None:  # which has an experiment of its own
         return ""
     for content in _experiments(str(name)):
         if at(content, key) not in (ABSENT, {}) and at(content, key) == at(config, key):
@@ -112,7 +112,7 @@ def _experiments(name: str) -> Iterator[dict[str, Any]]:
     """Yield the content of an experiment's file, and of those that it extends."""
     files = (folder / "experiment" / f"{name}.yaml" for folder in config_folders())
     if file := next((file for file in files if file.is_file()), None):
-        with suppress(UserError):  # what Hydra reads and this does not, such as aliases: the error itself is told
+        with suppress(UserError):  # YAML that only Hydra reads, such as aliases: the error then has no hint
             content = read_yaml(file, dict[str, Any])
             yield content
             for other in content.get("defaults") or ():
@@ -129,9 +129,9 @@ def _check_group(node: Any, group: Group, may_lack: bool) -> None:
 
 
 def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None:
-    """Check that values go together, and the task under every condition and with all other changes."""
+    """Check that values are compatible, and the task under every condition and with all other changes."""
     settings, validate, evaluate = experiment.settings, experiment.validate, experiment.evaluate
-    if settings.checkpoint is None:  # else the seeds of its own training count
+    if settings.checkpoint is None:  # with a checkpoint, the seeds of its own training count
         _require_apart(validate, evaluate)
     changed = {}
     if settings.job in ("evaluate", "improve"):

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 def copy_less() -> None:
-    """Let Hydra copy what knows its folders as little as it has to: it does so for every group that `--help` lists."""
+    """Make Hydra copy its config repository shallowly: it copies it for every group that `--help` lists."""
     ConfigRepository.__deepcopy__ = lambda repository, memo: copy(repository)  # type: ignore[attr-defined]
 
 
@@ -50,7 +50,7 @@ def compose(*overrides: str) -> DictConfig:
 def with_variant(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """Return a config without its `variants`, composed again with the overrides of the one that `variant` names.
 
-    `config` is as composed from `overrides`; a UserError if it has no such variant, or one of these contradicts it.
+    `config` was composed from `overrides`. Raises a UserError if there is no such variant, or an override opposes it.
     """
     with open_dict(config):
         name, variants = config.pop("variant"), config.pop("variants")
@@ -93,7 +93,7 @@ def compose_task(task: str, **overrides: Any) -> Node:
 
 @cache
 def axes() -> dict[str, dict[str, dict[str, Any]]]:
-    """Return group → option → node out of `conf/axes.yaml`, such as task/randomize/light → hard → node of a lamp."""
+    """Return group → option → node from `conf/axes.yaml`, such as task/randomize/light → hard → node of a lamp."""
     table = read_yaml(CONF / "axes.yaml", dict[str, dict[str, Any]])
     return {
         f"task/randomize/{axis}": {
@@ -105,7 +105,7 @@ def axes() -> dict[str, dict[str, dict[str, Any]]]:
 
 @cache
 def offer_axes() -> None:
-    """Register these options with Hydra, beside those that are files."""
+    """Register the options of `axes` with Hydra, in addition to those that are files."""
     for group, options in axes().items():
         for name, node in options.items():
             ConfigStore.instance().store(name=name, node=node, group=group, provider="vla")
@@ -126,9 +126,9 @@ def _hydra() -> Iterator[ConfigLoader]:
 
 
 def substitutes(task: Node, overrides: Sequence[str]) -> list[str]:
-    """Return an override for every part of a task that this machine cannot use, which its class names; log a warning.
+    """Return an override for every part of a task that this machine cannot use: the substitute that its class names.
 
-    None is for an option that the command line names: that fails, in a sentence.
+    Logs a warning for each. Options that the command line names are not replaced: building them raises a UserError.
     """
     found = []
     for name, node in task.items():

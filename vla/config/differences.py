@@ -22,7 +22,7 @@ def at(config: Any, key: str, absent: Any = ABSENT) -> Any:
 def differences(one: Any, other: Any, key: str = "") -> list[tuple[str, Any, Any]]:
     """Return dotted key and both values of every difference between two plain configs, except `NOT_COMPARED`.
 
-    A node that only one has is one entry, with `ABSENT` for the other; at the top level it is a job's and not compared.
+    A node that only one config has is one entry, with `ABSENT` for the other; top-level ones, of jobs, are left out.
     """
     if not (isinstance(one, Mapping) and isinstance(other, Mapping)):
         return [] if one == other else [(key, one, other)]

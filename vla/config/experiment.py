@@ -43,7 +43,7 @@ class Experiment:
     """A checked config. Its factories can be sent to worker processes, which inherit what is trusted."""
 
     nodes: Node  # plain, resolved
-    changes: list[Node] = field(default_factory=list)  # key, value and default of differences from the default, to show
+    changes: list[Node] = field(default_factory=list)  # differences from the default config, to show
 
     @classmethod
     def of(cls, cfg: DictConfig, default: DictConfig | None = None) -> Experiment:
@@ -72,12 +72,12 @@ class Experiment:
 
     @cached_property
     def origin(self) -> Origin:
-        """Where its results come from, found when it is first asked for."""
+        """Origin of the results, determined on first access."""
         return find_origin()
 
     @cached_property
     def settings(self) -> Settings:
-        """The values at the top."""
+        """The values at the top level of the config."""
         return Settings(**{each.name: self.nodes[each.name] for each in fields(Settings)})
 
     @cached_property
@@ -163,7 +163,7 @@ class Experiment:
         return partial(make_agent, {**node, **place}, "agent")
 
     def make_policy(self, checkpoint: Path | None = None) -> Callable[..., Policy]:
-        """Return the factory of the policy in a folder, by default `checkpoint`; a UserError if there is none."""
+        """Return the factory of the policy in a folder, by default `checkpoint`; raise a UserError if there is none."""
         checkpoint = checkpoint or self.checkpoint
         if checkpoint is None:
             raise UserError("this needs a trained policy: checkpoint=RUN")
@@ -180,18 +180,18 @@ class Experiment:
 
     @property
     def checkpoint(self) -> Path | None:
-        """Folder of the policy that the job uses, if given; a UserError if there is none."""
+        """Folder of the policy that the job uses, if given; raises a UserError if there is none."""
         return _policy_folder(self.settings.checkpoint)
 
     @property
     def pretrained(self) -> Path | None:
-        """Folder of the policy with the initial weights of a training, if given; a UserError if there is none."""
+        """Folder of the policy that initialises a training, if given; raises a UserError if there is none."""
         return _policy_folder(self.settings.pretrained)
 
     def learner(self, spec: Spec, origin: Path | None = None, last: Path | None = None) -> Learner:
-        """Build the learner with initial weights; without any, fit its tokenizer afterwards with `fit_tokenizer`.
+        """Build the learner with initial weights; without any, the caller must then call `fit_tokenizer`.
 
-        There is a UserError if one of them is damaged, or the policy has another spec.
+        Raises a UserError if the policy or checkpoint is damaged, or the policy has another spec.
 
         Args:
             spec: of the demonstrations.
@@ -238,7 +238,7 @@ class Experiment:
     def data(self, store: EpisodeStore, history: int, chunk: int, model: Model | None = None) -> WindowDataModule:
         """Build windows of `history` frames and `chunk` actions from the episodes that `collect` names.
 
-        Those for a `model` fit its spec, and have its tokens of the instructions.
+        With a `model`, they match its spec and contain the tokens of its instructions.
         """
         windows = {"history": history, "chunk": chunk, "tokenize": model.text.tokenize if model else None}
         episodes = {"episodes": self.collect.episodes, "more": self.collect.more or ()}
@@ -247,7 +247,7 @@ class Experiment:
 
 
 def _class_differs(key: str, here: Node, there: Node) -> bool:
-    """Return whether the node that has a dotted key is built from another class in one of two configs."""
+    """Return whether the node that contains a dotted key has different classes in two configs."""
     target = f"{key.rpartition('.')[0]}._target_"
     return at(here, target) != at(there, target)
 
@@ -266,7 +266,7 @@ def plain(node: DictConfig) -> Node:
 
 
 def make_environment(task: Node) -> Environment:
-    """Build the environment of a task node; a UserError if nothing can act in it."""
+    """Build the environment of a task node; raise a UserError if nothing can act in it."""
     without_triton()
     environment = build(task, "task")
     if isinstance(environment, SpecOnly):
@@ -279,7 +279,7 @@ def make_environment(task: Node) -> Environment:
 
 
 def make_agent(node: Node, group: str, environment: Environment) -> Agent:
-    """Build the expert, or the agent, for an environment; a UserError if it is a recording, which cannot act."""
+    """Build the expert, or the agent, for an environment; raise a UserError if it is a recording, which cannot act."""
     agent: Agent = build(node, group, spec=environment.spec)
     if not hasattr(agent, "act"):
         raise UserError("recorded demonstrations cannot act: this job needs the expert of a world that can be played")
@@ -289,13 +289,13 @@ def make_agent(node: Node, group: str, environment: Environment) -> Agent:
 def make_policy(policy: Node, checkpoint: Path, environment: Environment | None = None, *, own: bool = False) -> Policy:
     """Build the policy in a folder with the options of a policy node.
 
-    There is a UserError if there is no policy, its spec differs from the environment's, or it names what it may not.
+    Raises a UserError without a policy, if its spec does not fit, or if it names a path, address or untrusted class.
 
     Args:
         policy: the node.
         checkpoint: the folder.
-        environment: that the policy is to act in.
-        own: the policy may name paths and addresses, because it is of this run, or was looked through before.
+        environment: in which the policy is to act.
+        own: the policy may name paths and addresses, because it is of this run, or was checked before.
     """
     from vla.models.policy_folder import read_policy
 
@@ -320,7 +320,7 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
 def training_policy(precision: str, model: Model) -> Policy:
     """Build the policy of a model in training, on the model's device and without a second compilation or an export."""
     device = next(model.parameters()).device
-    if device.type == "cuda":  # in a worker process, too, that of the model
+    if device.type == "cuda":  # make it the current one, also in a worker process
         import torch
 
         torch.cuda.set_device(device)
@@ -335,7 +335,7 @@ def _policy_folder(name: str | None) -> Path | None:
 
 
 def _model(nodes: Node, spec: Spec, saved: SavedPolicy | None = None, weights: bool = False) -> Model:
-    """Build the model of a config, and its tokenizer; if it gets `weights`, without loading pretrained ones.
+    """Build the model of a config, with its tokenizer; pretrained weights are skipped if `weights` will replace them.
 
     A model that is larger than the weights of the `saved` policy is refused.
     """
@@ -352,7 +352,7 @@ def _model_node(nodes: Node, saved: SavedPolicy | None, weights: bool) -> Node:
 
 
 def _without_weights(model: Node) -> Node:
-    """Return a model node without its initial weights, or those of its image encoders, which lie in the policy."""
+    """Return a model node without pretrained weights, also of its encoders: the policy contains the trained ones."""
     nodes = {name: node for name, node in model.items() if isinstance(node, dict)}
     parts = {name: _without_weights(node) for name, node in nodes.items() if name in ("image", "context", "network")}
     none = {"pretrained": False, "trunk": None}

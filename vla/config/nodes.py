@@ -1,4 +1,4 @@
-"""Classes of the config nodes that say what jobs do: their fields are the schema, as of every node.
+"""Classes of the config nodes that tell jobs what to do: as for every node, the fields are the schema.
 
 They are light to import, because a config is checked before its job is.
 """
@@ -78,7 +78,7 @@ class Validation:
 class Evaluation:
     """Episodes of an evaluation, what they are to decide, and further conditions on the same seeds.
 
-    There is a UserError if two conditions have one name.
+    Raises a UserError if two conditions have the same name.
     """
 
     episodes: Count  # with `until`, at most
@@ -87,7 +87,7 @@ class Evaluation:
     bar: Between | None  # success rate to compare with
     against: Text | None  # run to compare with on the same episodes
     margin: Between  # loss of success that counts as not worse
-    recordings: Literal["all", "failures"] | Natural  # episodes to record; failures: and ten successes
+    recordings: Literal["all", "failures"] | Natural  # episodes to record; failures: also ten successes
     conditions: dict[str, Changes]  # name → overrides of the task
     one_by_one: dict[str, dict[str, Changes]]  # level → overrides of the task, each part of which is a condition
     without: Annotated[list[Literal["images", "instruction", "both"]], Predicate(unique)]  # what the policy lacks
@@ -95,7 +95,7 @@ class Evaluation:
     networks: dict[str, Changes]  # nodes of `vla.rollouts.realtime.Network`
 
     def __post_init__(self) -> None:
-        """Require names of their own."""
+        """Require that every condition has a name of its own."""
         changed = [*self.conditions, *(name for name, _ in _separate(self.one_by_one))]
         for name, count in Counter([IN_DISTRIBUTION, *changed, *self.of_agents]).items():
             if count > 1:
@@ -160,7 +160,7 @@ class Power:
 
 @dataclass(frozen=True)
 class Inspection:
-    """Stores that `job=inspect` verifies and describes, and what it makes of them."""
+    """Stores that `job=inspect` verifies and describes, and the new store that it makes of them."""
 
     folder: Text
     stores: Annotated[list[Text], MinLen(1)] | None  # to merge, instead of `folder`
@@ -187,7 +187,7 @@ class Benchmark:
 def conditions(together: Mapping[str, Changes], one_by_one: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return condition → overrides of the task node: those of `together`, then each part of `one_by_one`.
 
-    A part at a level is named `part_level`, or `part` if all levels are equal. What is null at every level is left out.
+    A part at a level is named `part_level`, or `part` if all levels are equal; it is left out if null at every level.
 
     Args:
         together: condition → overrides.
@@ -197,7 +197,7 @@ def conditions(together: Mapping[str, Changes], one_by_one: Mapping[str, Any]) -
 
 
 def _separate(one_by_one: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    """Return name and overrides of every part, in which names can be equal."""
+    """Return name and overrides of every part; names may repeat."""
     levels: dict[tuple[str, str], dict[str, Any]] = {}
     for level, overrides in one_by_one.items():
         for argument, parts in overrides.items():

@@ -16,8 +16,8 @@ from vla.config.packages import config_folders, option_packages, trusted
 from vla.io.documents import STRICT
 from vla.parallel.limits import cores, processor
 
-SECRET = "api_key"  # key whose values no file is to hold
-SECONDS = 10  # that git may take
+SECRET = "api_key"  # key whose values are written to no file
+SECONDS = 10  # longest duration of a git command
 DIRTY = "with uncommitted changes"  # in the code of a tree
 
 
@@ -28,7 +28,7 @@ class Origin:
     __pydantic_config__ = STRICT
 
     command: str  # empty if it is unknown; secrets are replaced by asterisks
-    commits: dict[str, str]  # name of a git work tree with code → its commit, and whether that is all
+    commits: dict[str, str]  # name of a git work tree with code → its commit, and whether it is dirty
     host: str
     processor: str
 

@@ -59,7 +59,7 @@ def config_folders() -> tuple[Path, ...]:
 
 @cache
 def option_folders() -> tuple[tuple[str, Path], ...]:
-    """Return (package, folder of options) of installed packages; a UserError if one has no such folder."""
+    """Return (package, folder of options) of installed packages; raise a UserError if one has no such folder."""
     found = []
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.value):
         package, *parts = entry.value.split(".")
@@ -76,13 +76,13 @@ def option_folders() -> tuple[tuple[str, Path], ...]:
 
 
 def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> None:
-    """Set the third-party classes that this process and its children may build; a UserError if they cannot be trusted.
+    """Set the third-party classes that this process and its children may build; raise a UserError for unsuitable ones.
 
     Args:
         packages: list of names, in addition to those in the environment variable `VLA_TRUST`.
         chosen: every `_target_` in the config composed from the command line, before any file is read. Of packages that
             add options, exactly these classes are trusted.
-        used: every `package` in it, which is trusted.
+        used: every `package` argument in that config; these packages are trusted, too.
     """
     if not isinstance(packages, list):
         raise UserError(f"trust must be a list of packages, as in trust=[mypackage], got {packages!r}")
@@ -97,7 +97,7 @@ def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> Non
 
 @contextmanager
 def trusting(packages: Sequence[str]) -> Iterator[None]:
-    """Trust further packages within the context; a UserError if they cannot be trusted."""
+    """Trust further packages within the context; raise a UserError if they cannot be trusted."""
     if isinstance(packages, str):
         raise UserError(f"trust must be a list of packages, as in trust=[{packages!r}], got {packages!r}")
     for name in packages:

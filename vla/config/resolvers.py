@@ -1,4 +1,4 @@
-"""Own resolvers of `conf/`: `${digest:…}`, `${chosen:…}`, `${recorded:…}` and `${jobs:}`."""
+"""Custom resolvers for `conf/`: `${digest:…}`, `${chosen:…}`, `${recorded:…}` and `${jobs:}`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def digest(*keys: str, _root_: DictConfig) -> str:
     """Resolve `${digest:task,expert,collect.seed}`: twelve hexadecimal digits of the values at dotted `keys`.
 
-    The order of mappings matters: randomisation axes are applied in it. Null equals an absent key, and 10 equals 10.0.
+    The order of keys matters, because randomisation axes are applied in it. Null equals an absent key, 10 equals 10.0.
     """
     values = [OmegaConf.select(_root_, key, throw_on_missing=True) for key in keys]
     plain = [OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value for value in values]
@@ -41,7 +41,7 @@ def chosen(group: str, *, _root_: DictConfig) -> str | None:
 def recorded(name: str, *, _root_: DictConfig) -> Any:
     """Resolve `${recorded:NAME}`: an attribute of the expert's `Recording`, or `low` or `high`, the bounds of actions.
 
-    There is a UserError if the expert reads no recording, or there is none.
+    Raises a UserError if the expert reads no recording, or the recording does not exist.
     """
     found = _recording(json.dumps(OmegaConf.to_container(_root_.expert, resolve=True)))
     if name not in ("low", "high"):
@@ -55,7 +55,7 @@ def recorded(name: str, *, _root_: DictConfig) -> Any:
 
 @lru_cache(maxsize=8)  # every value of a task asks for it
 def _recording(expert: str) -> Recording:
-    """Describe the recording of a node of the group `expert`, which is JSON."""
+    """Describe the recording that a node of the group `expert` reads; the node is given as JSON."""
     from vla.data.formats.imported_demonstrations import ImportedDemonstrations
 
     options, group = json.loads(expert), GROUPS["expert"]

@@ -1,4 +1,4 @@
-"""Goals of the ROS 2 actions that arms and grippers listen to, and what their servers say about them."""
+"""Client of the ROS 2 actions of arms and grippers: it sends goals, and checks what the servers answer."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class _Sent:
 
     at: float
     handle: Any = None  # once it is accepted
-    over: bool = False  # it has ended, or what becomes of it no longer counts
+    over: bool = False  # it has ended, or its result no longer matters
     cancelled: bool = False
 
     def cancel(self) -> None:
@@ -58,7 +58,7 @@ class GoalSender:
         self._failed = False
 
     def prepare(self) -> None:
-        """Require the server, and begin anew; raise a UserError if it does not show up."""
+        """Wait for the server, and forget earlier goals and failures; raise a UserError if it does not appear."""
         if not self._client.wait_for_server(PATIENCE):
             kind = f"{self.kind.__module__.partition('.')[0]}/action/{self.kind.__name__}"
             raise UserError(

@@ -51,8 +51,8 @@ def opened(folder: Path) -> Iterator[Any]:
 def messages_of(
     reader: Any, topics: Collection[str | None], folder: Path, start: int | None = None, stop: int | None = None
 ) -> Iterator[tuple[str, int, Any]]:
-    """Yield topic, time [ns] and content of every message on some topics, from `start` to before `stop` [ns]
-    (UserError: the bag is damaged)."""
+    """Yield topic, time [ns] and content of every message on some topics, from `start` to before `stop` [ns];
+    raise a UserError if the bag is damaged."""
     connections = [connection for connection in reader.connections if connection.topic in topics]
     messages, types = reader.messages(connections, start, stop), message_types()
     while True:

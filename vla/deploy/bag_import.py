@@ -33,7 +33,7 @@ STATUS = "/vla_agent/status"  # end of the name of the topic that tells who move
 GAP = 0.3  # longest time between two commands of one motion [s]
 MEASURED_WITHIN = 0.2  # largest time between an observation and its joint state [s]
 STILL, STILL_OPENING = 0.01, 0.002  # an arm that has moved less [rad], and its gripper [m], is at rest
-LEAD = 0.1  # of a person's motion that are kept before it begins and after it ends [s]
+LEAD = 0.1  # time that is kept before a person's motion begins and after it ends [s]
 LATE = 1.5  # longest time between two steps without a warning [control periods]
 SHORTEST = 0.5  # shorter segments are left out [s]
 MOSTLY = 0.5  # largest share of a component's actions beyond its bounds; a larger one means other units
@@ -45,14 +45,14 @@ WHEN = itemgetter(0)
 
 
 class _Picture(NamedTuple):
-    """An image, which is read again when it is needed."""
+    """An image; its pixels are read again when they are needed."""
 
     camera: str
     taken: float
 
 
 class _Followed(NamedTuple):
-    """What an arm follows at a time."""
+    """The instruction that an arm follows at a time, and who moves it."""
 
     number: int  # of the instruction: the same one may be given again
     instruction: str
@@ -60,7 +60,7 @@ class _Followed(NamedTuple):
 
 
 class _Segment(NamedTuple):
-    """A time in which one instruction was followed, by the policy or a person."""
+    """A period in which one instruction was followed, by the policy or a person."""
 
     instruction: str
     person: bool
@@ -96,7 +96,7 @@ class _Bag:
             self.kinds = {connection.topic: connection.msgtype for connection in reader.connections}
             status = next((topic for topic in self.kinds if topic.endswith(STATUS)), None)
             self._has_status = status is not None
-            self._person = None if status else True  # who moves the arm: True, False (the policy) or nobody
+            self._person = None if status else True  # whether a person moves the arm, or the policy; None: neither
             handlers: dict[str | None, Callable[[float, Any], None]] = {
                 **{topics.joint_states: self._measure, topics.finger_states: self._measure},
                 **{topics.instruction: self._instruct, topics.commands: self._command},
@@ -129,7 +129,7 @@ class _Bag:
                 raise UserError(f"{self.folder}: no message on {topic} can be used: {why}")
 
     def segments(self) -> Iterator[_Segment]:
-        """Yield the times in which an instruction was followed; those of a person while the arm moves."""
+        """Yield the periods in which an instruction was followed, by a person only while the arm moves."""
         for followed, group in groupby(zip(self._followed, self.measured, strict=True), key=itemgetter(0)):
             if followed is None:
                 continue
@@ -156,7 +156,7 @@ class _Bag:
         self.inputs.append((at, _Picture(camera, self._taken(at, message))))
 
     def _taken(self, at: float, message: Any) -> float:
-        """Return when a message that came at `at` was taken, by its time stamp unless that is of another clock."""
+        """Return when a message's content was captured: its time stamp if plausible, else `at`, when it came."""
         taken = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
         age = self._start + at - taken
         return at - age if taken and 0 <= age < OLDEST else at
@@ -205,11 +205,11 @@ class _Bag:
 
 
 class BagDemonstrations(imported.ImportedDemonstrations):
-    """Episodes of bags, at the control rate of the task, with the observations that the policy node makes of them
-    (UserError: a bag is missing, damaged or incomplete, lacks topics, or is of another robot).
+    """Episodes of bags, at the control rate of the task, with the observations that the policy node makes of them.
+    Raises a UserError if a bag is missing, damaged or incomplete, lacks topics, or is of another robot.
 
-    An episode is a time in which one instruction was followed, by the policy, or by a person to whom the arm was handed
-    over, from motion to rest; `recorded.person` in its draws tells which. Without the topic of the node's status a
+    An episode is a period in which one instruction was followed, by the policy, or, from motion to rest, by a person to
+    whom the arm was handed over; `recorded.person` in its draws tells which. Without the topic of the node's status a
     person always moves the arm. The action of a step is the motion that was commanded for one control period; where
     none was, as when an arm is guided by hand, the measured one. Actions beyond the bounds of the task are clipped,
     depth is 0. Whether an episode succeeded is not known: its outcome is "unverified".
@@ -282,11 +282,11 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         return segment.instruction, np.array([step.state for step in steps]), self._actions[number]
 
     def _steps(self, bag: _Bag, segment: _Segment) -> list[_Step]:
-        """Return the steps of a segment, made as the policy node makes its observations; a UserError without any."""
+        """Return the steps of a segment, made as the policy node makes observations; raise a UserError without any."""
         observer, steps, period = Observer(self.spec), list[_Step](), 1 / self.spec.control_hz
         first = bisect_left(bag.inputs, segment.start - HISTORY, key=WHEN)
         stop = bisect_right(bag.inputs, segment.end, key=WHEN)
-        last, nominal, longest = -np.inf, -np.inf, 0.0  # step, time of the next one, and time between two [s]
+        last, nominal, longest = -np.inf, -np.inf, 0.0  # time of the last step, due time of the next, longest gap [s]
         for now, each in bag.inputs[first:stop]:
             if isinstance(each, Measured):
                 observer.add_joint_state(each)
@@ -331,7 +331,7 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         if self._gripper is None:
             return motion
         told = bag.openings[: bisect_right(bag.openings, end, key=WHEN)][-1:]
-        if told and told[0][0] >= segment.start:  # a command of before is the policy's, not the person's
+        if told and told[0][0] >= segment.start:  # an earlier command was the policy's, not the person's
             return np.insert(motion, self._gripper, told[0][1])
         return np.insert(motion, self._gripper, _between(bag.measured, end)[joints] / self._limits.stroke)
 
@@ -357,7 +357,7 @@ def _read_bags(folder: Path | str | None, topics: Topics, limits: JointLimits) -
 
 
 def _segments(bags: Sequence[_Bag], cameras: Sequence[str]) -> list[tuple[_Bag, _Segment]]:
-    """Return the segments that are episodes: those with images of all cameras; a UserError if there are none."""
+    """Return the segments that are episodes: those with images of all cameras; raise a UserError if there are none."""
     found = []
     for bag, segment in ((each, segment) for each in bags for segment in each.segments()):
         if blind := [camera for camera in cameras if not bag.sees(camera, segment)]:

@@ -1,4 +1,4 @@
-"""What a client of the policy server sends, as an observation of the policy."""
+"""Conversion of the messages of a policy server's clients to observations of the policy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LARGEST_IMAGE = 4096  # pixels in a row or column
 class Keys:
     """Keys of a client's observation; a key that is absent is also looked up as a path of nested maps."""
 
-    images: dict[str, Text]  # camera → image, by default its name; "picture": the whole one of which some show parts
+    images: dict[str, Text]  # camera → key, by default its name; "picture": the whole of which some cameras show parts
     state: Annotated[list[Text], MinLen(1)]  # vectors to concatenate
     prompt: Text  # instruction
 
@@ -29,7 +29,7 @@ class Keys:
         return {camera: self.images.get(camera, camera) for camera in spec.given(self.images)}
 
     def observation(self, message: Any, spec: Spec) -> Observation:
-        """Convert a client's observation, whose images may have any size; a UserError if it does not match the spec."""
+        """Convert a client's observation, with images of any size; raise a UserError if it does not match the spec."""
         if not isinstance(message, Mapping):
             raise UserError(f"an observation is a map, not {type(message).__name__}")
         cameras = self.cameras(spec)

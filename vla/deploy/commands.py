@@ -1,4 +1,4 @@
-"""What the policy node tells an arm and its gripper: messages, and goals of actions."""
+"""Outputs of the policy node to an arm and its gripper: messages and action goals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vla.deploy.lifecycle_node import GuardedLifecycleNode
 from vla.deploy.motion import Command
 from vla.deploy.settings import FOLLOW, PolicySettings, action_class
 
-# Time of a plan in every trajectory [s]. The next tick replaces it, and all of a long plan would take more than a tick.
+# Time of a plan in every trajectory [s]: the next tick replaces it, and computing all of a long plan outlasts a tick.
 AHEAD = 0.3
 CLOSE_BELOW, OPEN_ABOVE = 0.4, 0.6  # commanded opening of a gripper at which its goal changes
 REPLACED = (0, -1)  # error codes of FollowJointTrajectory for a goal that another one has replaced
@@ -26,7 +26,7 @@ REPLACED = (0, -1)  # error codes of FollowJointTrajectory for a goal that anoth
 class ArmOutput:
     """Publishes every command for the arm; in a dry run below ~/dry_run, where nothing obeys.
 
-    FollowJointTrajectory gets a goal whenever the plan changes, and the commands are published for recordings.
+    With FollowJointTrajectory a goal is sent whenever the plan changes, and commands are published for recordings only.
     """
 
     def __init__(self, node: GuardedLifecycleNode, loop: ControlLoop, settings: PolicySettings) -> None:
@@ -66,8 +66,8 @@ class ArmOutput:
 class GripperOutput:
     """Publishes the positions of the fingers; in a dry run, or beside the goals of an action, as a copy for recordings.
 
-    Of an action there is one goal at a time, and another one only when the commanded state changes: open above
-    `OPEN_ABOVE`, closed below `CLOSE_BELOW`.
+    An action gets one goal at a time, and a new one only when the commanded state changes: open above `OPEN_ABOVE`,
+    closed below `CLOSE_BELOW`.
     """
 
     def __init__(self, node: GuardedLifecycleNode, loop: ControlLoop, settings: PolicySettings, topic: str) -> None:
@@ -84,7 +84,7 @@ class GripperOutput:
         self.reset()
 
     def reset(self) -> None:
-        """Send the next goal even if it repeats the last."""
+        """Forget the last goal, so that the next one is sent even if it is equal."""
         self._wanted: bool | None = None  # open?
         self._sent: bool | None = None
 

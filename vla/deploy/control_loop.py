@@ -31,8 +31,8 @@ class _Pending:
 
     since: float
     observed: float  # time stamp of its observation
-    anchor: Array  # (J,) joints from which Cartesian actions go on
-    outdated: bool = False  # whatever it returns is not to be executed
+    anchor: Array  # (J,) joints from which Cartesian actions start
+    outdated: bool = False  # its plan must not be executed
 
 
 class ControlLoop:
@@ -52,9 +52,9 @@ class ControlLoop:
         limits: of the arm.
         safety: time-outs and limits.
         command_hz: commands per second [Hz].
-        follows_positions: whether the arm goes where the commands say. Otherwise it goes its own way, as in a dry run,
-            and the commands of every plan start at the measured pose.
-        execute: actions of a plan after which the next one is asked for, which continues it; None: at its end.
+        follows_positions: whether the arm follows the commands. Otherwise, as in a dry run, the commands of every plan
+            start at the measured pose.
+        execute: number of actions of a plan after which the next one, which continues it, is requested; None: all.
 
         Raises:
             UserError: the policy does not fit the arm or the command rate.
@@ -71,7 +71,7 @@ class ControlLoop:
         self.state, self.reason = State.WAITING, "no joint state yet"
         self.instruction, self._instructed_at, self._said_at = "", 0.0, -np.inf
         self.late_plans, self.rejections, self.handed_over = 0, 0, False
-        self.obstacle = ""  # why the arm is held until this is empty again, beside what is seen here
+        self.obstacle = ""  # external reason to hold the arm until this is empty again
         self.motion = Motion(self.limits, self.tick, 1 / self.spec.control_hz, self.goals.workspace)
         self._observer, self._tracking = Observer(self.spec), Tracking(self.safety, self._follows_positions)
         self._pending: _Pending | None = None
@@ -125,14 +125,14 @@ class ControlLoop:
         return True
 
     def hand_over(self) -> None:
-        """Leave the arm, which is to be at rest, to a person; nothing is commanded from now on."""
+        """Leave the arm, which must be at rest, to a person; nothing is commanded from now on."""
         self.handed_over, self._pending = True, None
         if self.state not in (State.STOPPED, State.FAULT):
             self._wait_to_run("")
 
     def take_back(self, now: float) -> None:
-        """Command the arm again, from its measured pose; the gripper is left as it is until the policy moves it
-        (UserError: the arm moves, is outside its limits, or has no recent joint state; the person keeps it)."""
+        """Command the arm again, from its measured pose; the gripper stays as it is until the policy moves it. Raises a
+        UserError if the arm moves, is outside its limits, or has no recent joint state; the person then keeps it."""
         measured = self._observer.newest
         if (old := self._joints_problem(now)) or measured is None:
             raise UserError(old)
@@ -186,7 +186,7 @@ class ControlLoop:
     def set_plan(self, actions: Array) -> bool:
         """Schedule the policy's actions (k, D); the first one starts at the time of the observation.
 
-        Returns whether the arm follows them: not if they are unusable, or answer an observation of before.
+        Returns whether the arm follows them: not if they are unusable or outdated, or the loop is not running.
 
         Actions in the past are skipped, but still count towards the goals of later Cartesian ones.
         """
@@ -235,13 +235,13 @@ class ControlLoop:
         newest = self._observer.newest
         if newest is None:
             return
-        if not self.motion.started and self.state is not State.FAULT:  # which a person must look at first
+        if not self.motion.started and self.state is not State.FAULT:  # after which a person must inspect the arm
             if old := self._joints_problem(now):  # the arm may be elsewhere by now
                 return None if self.state is State.STOPPED else self._set_state(self.state, old)
             self._take_over(newest, now)
         off_track, moved_unseen = self._tracking.check(self.motion, newest, now)
         if moved_unseen or (off_track and self._held):
-            # Where it was commanded before does not matter any more: the arm would rush back there.
+            # The earlier commanded pose is dropped, because the arm would rush back to it.
             self.motion.hold(newest.joints)
             if self.state is not State.FAULT:
                 self.fail("the arm was moved while it was held")
@@ -255,7 +255,7 @@ class ControlLoop:
             self.stop(f"time-out: {self.safety.instruction:g} s on one instruction", "send the next instruction")
             self._timed_out = True
         elif problem := self._input_problem(newest, now):
-            # A held arm moves again after frames in a row, not after some good ones in between.
+            # A held arm moves again only after consecutive fresh frames.
             self._observer.fresh = 0
             self._set_state(State.HOLDING if self.state is State.RUNNING else self.state, problem)
         elif self.state is State.WAITING or self._observer.fresh >= self.safety.fresh_frames:
@@ -298,7 +298,7 @@ class ControlLoop:
         self.state, self.reason = state, reason
 
     def _drop_plans(self) -> None:
-        """Brake until the next plan, and ignore an inference under way: it answers an observation of before."""
+        """Brake until the next plan, and ignore an inference under way, whose observation is outdated."""
         self.motion.follow([])
         if self._pending is not None:
             self._pending.outdated = True

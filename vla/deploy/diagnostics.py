@@ -1,4 +1,4 @@
-"""What the policy node tells about itself: its state, latencies and dropped messages."""
+"""Diagnostics of the policy node: its state, latencies and dropped messages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vla.deploy.messages import HANDED_OVER, shorten
 from vla.deploy.safety import State
 
 LEVELS = dict.fromkeys((State.HOLDING, State.STOPPED), DiagnosticStatus.WARN) | {State.FAULT: DiagnosticStatus.ERROR}
-RECENT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # also for whoever comes later
+RECENT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # also for late subscribers
 MAX_MESSAGE = 300  # length of a log line or status message [characters]
 
 
@@ -39,7 +39,7 @@ class Diagnostics:
         self._node.get_logger().warning(shorten(reason, MAX_MESSAGE), throttle_duration_sec=1.0)
 
     def ignore(self, message: str) -> None:
-        """Tell once that an instruction is ignored, until the state changes."""
+        """Report that an instruction is ignored, once until the state changes."""
         if message != self._ignored:
             self._ignored = message
             self._node.get_logger().warning(shorten(message, MAX_MESSAGE))

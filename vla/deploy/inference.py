@@ -61,11 +61,11 @@ class Inference:
         if first:
             self._policy.reset(observation.instruction, next(self._episodes))
         plan = self._policy.plan(observation)
-        # What the next plan continues goes on until that is there.
+        # A plan that the next one continues is executed until that one arrives.
         chosen = plan if getattr(self._policy, "chunking", None) else plan[: executed(self._policy)]
         return chosen, time.monotonic() - began
 
 
 def executed(policy: Policy) -> int:
-    """Return how many actions of a plan are executed: one with a history, whose frames have no gaps in training."""
+    """Return how many actions of a plan are executed: one with a history, as in training its frames have no gaps."""
     return 1 if getattr(policy, "history", 1) > 1 else int(policy.execute)

@@ -1,4 +1,4 @@
-"""What the policy node hears: images, joint states and instructions."""
+"""Inputs of the policy node: images, joint states and instructions."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Inputs:
         """Args: the node; its loop, settings and diagnostics; `advance` is called after an image."""
         self._node, self._loop, self._diagnostics, self._advance = node, loop, diagnostics, advance
         self._joint_states = messages.JointStates(loop.limits)
-        self._stamps: dict[str, tuple[int, int]] = {}  # what is stamped → its last time stamp
-        self._synchronised: set[str] = set()  # of these, those whose clock has been that of this node
+        self._stamps: dict[str, tuple[int, int]] = {}  # source → its last time stamp
+        self._synchronised: set[str] = set()  # sources that once had the clock of this node
         topics = settings.topics
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # matches every publisher
         for camera in loop.spec.cameras:
@@ -52,7 +52,7 @@ class Inputs:
             return
         now = time.monotonic()
         try:
-            age = self._age(camera, message)  # first: decoding takes its time
+            age = self._age(camera, message)  # first, because decoding takes time
             image = messages.image_from(message)
         except UserError as error:
             return self._diagnostics.drop(f"camera {camera}: {error}")
@@ -61,8 +61,8 @@ class Inputs:
         self._advance()
 
     def _age(self, source: str, message: Any) -> float:
-        """Return the age of a message [s] by its time stamp, 0 if that is of another clock (UserError: the clock is
-        frozen, or the message is older than any of another clock would be)."""
+        """Return the age of a message [s] by its time stamp, 0 if that is of another clock. Raises a UserError if the
+        clock is frozen, or the message is older than `OLDEST` although the clock was once that of this node."""
         stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
         if stamp == (0, 0):
             return 0.0

@@ -22,8 +22,8 @@ REST = 1e-9  # lower speeds are rounding errors [rad/s]
 
 @dataclass(frozen=True)
 class JointLimits:
-    """Names and limits of the joints of an arm and its gripper (UserError: lists of different lengths, or a lowest
-    position that is not below the highest).
+    """Names and limits of the joints of an arm and its gripper. Raises a UserError if lists have different lengths, or
+    the lowest position of a joint, with the margin, is not below the highest.
 
     Attributes:
         joints: J names, base to tip.

@@ -18,12 +18,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from vla.io.errors import UserError
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # whoever comes later gets the last message
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # late subscribers get the last message
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
 def transition(do: Callable[[Any, LifecycleState], Any]) -> Callable[[Any, LifecycleState], TransitionCallbackReturn]:
-    """Make a method the callback of a transition, which an exception refuses; that of a UserError is one sentence."""
+    """Make a method the callback of a transition, which exceptions refuse; a UserError is logged as one sentence."""
 
     @wraps(do)
     def tried(node: GuardedLifecycleNode, state: LifecycleState) -> TransitionCallbackReturn:
@@ -39,7 +39,7 @@ def transition(do: Callable[[Any, LifecycleState], Any]) -> Callable[[Any, Lifec
 
 
 class GuardedLifecycleNode(LifecycleNode):
-    """Base of managed nodes, which tell what they create, so that a cleanup can destroy it."""
+    """Base of managed nodes; it registers what they create, so that a cleanup can destroy it."""
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)

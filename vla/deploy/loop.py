@@ -48,9 +48,9 @@ class Loop:
     output: Path
 
     def run(self) -> Report | None:
-        """Play all episodes, up to the first that ends in an error, which is raised if there is no other.
+        """Play all episodes, up to the first that ends in an error, which is raised if none was completed before.
 
-        The result is None if it was interrupted before the first episode was over.
+        Returns None if interrupted before the first episode was over.
         """
         with self.running() as operator:
             results: list[Result] = []
@@ -99,7 +99,7 @@ class Loop:
                 node = create_node("vla_operator")
                 opened.callback(node.destroy_node)
                 operator = DemoOperator(node, agent.topics.instruction, stopped, *processes)
-                # To the end: an episode that fails is the one to look at.
+                # Recorded to the end, because a failed episode is the one to inspect.
                 opened.enter_context(closing(BagRecorder(node, self.output / "bag")))
                 yield operator
         finally:

@@ -30,10 +30,10 @@ ENCODINGS = {
     "bgra8": (4, slice(2, None, -1)),
 }
 
-HANDED_OVER = "handed over"  # in the agent's status: yes if a person moves the arm, always in a dry run; no
+HANDED_OVER = "handed over"  # in the agent's status: yes if a person moves the arm, and in a dry run; else no
 LONGEST = 100_000  # characters of a message about an episode
 FINGERS_AGE = 0.5  # oldest state of fingers that come in messages of their own [s]
-BEYOND = 0.5  # its limits, where an arm that a person moved may still be [rad]
+BEYOND = 0.5  # distance outside its limits at which an arm moved by a person may still be [rad]
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class SimulatedEpisode:
     seed: Seed
     instruction: Annotated[str, MaxLen(LONGEST_INSTRUCTION)]
     done: bool
-    steps: Natural  # of control since the instruction, and simulated time
+    steps: Natural  # control steps since the instruction; below, their simulated time
     seconds: NonNegative
     outcome: Name
     task: Annotated[str, MaxLen(100)]
@@ -64,7 +64,7 @@ def shorten(text: str, longest: int = 80) -> str:
 
 
 def image_from(message: Any) -> Array:
-    """Read the (H, W, 3) uint8 RGB image of a sensor_msgs/Image or CompressedImage; a UserError if it is none."""
+    """Read the (H, W, 3) uint8 RGB image of a sensor_msgs/Image or CompressedImage; raise a UserError if it is none."""
     if hasattr(message, "format"):  # whatever it says
         return decode_image(bytes(message.data))
     if message.encoding not in ENCODINGS:
@@ -91,19 +91,19 @@ class JointStates:
     """Joint states of an arm, whose fingers come in the same messages or in others."""
 
     def __init__(self, limits: JointLimits) -> None:
-        """Args: the limits, of which the names of the joints matter here."""
+        """Args: the limits, of which names and positions are used."""
         self._limits, self._fingers = limits, (-np.inf, 0.0)  # when they came, opening
 
     def read(self, message: Any, at: float) -> tuple[Array, Array, float] | None:
-        """Read positions (J,) [rad], velocities (J,) [rad/s] and gripper opening [m] of a sensor_msgs/JointState
-        (UserError: a joint is missing, named twice or beyond limits, the lengths differ, or a number is not finite).
+        """Return positions (J,) [rad], velocities (J,) [rad/s] and gripper opening [m] in a sensor_msgs/JointState.
 
-        Joints are found by name. Missing velocities, also NaN, become zero. A message with the fingers only returns
-        None, and gives later ones the opening for as long as `FINGERS_AGE`.
+        Joints are found by name. Missing velocities, also NaN, become zero. A message with only the fingers returns
+        None, and provides the opening for later ones during `FINGERS_AGE`. Raises a UserError if a joint is missing,
+        named twice or far beyond its limits, the lengths differ, or a number is not finite.
 
         Args:
             message: the message.
-            at: when it came [s].
+            at: when it was captured [s].
         """
         arm, fingers, names = self._limits.joints, self._limits.fingers, {*message.name}
         of_gripper = names >= {*fingers} and names.isdisjoint(arm)  # which may have further joints
@@ -144,8 +144,8 @@ def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
 
 
 def command_from(names: Sequence[str], positions: Any, limits: JointLimits) -> tuple[Array, float | None]:
-    """Read target positions (J,) [rad] and opening 0 … 1, or None without fingers, of a command, by name (UserError: a
-    joint is missing, the lengths differ, or a number is not finite)."""
+    """Return target positions (J,) [rad] and opening 0 … 1, or None without fingers, of a command, by name. Raises a
+    UserError if a joint is missing, the lengths differ, or a number is not finite."""
     names, positions = list(names), np.array(positions, dtype=float)
     missing = [name for name in limits.joints if name not in names]
     if missing or len(names) != len(positions) or not np.isfinite(positions).all():

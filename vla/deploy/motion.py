@@ -46,7 +46,7 @@ class _Workspace:
     high: Array
 
     def step(self, limiter: JointLimiter, goal: Array, remaining: float) -> None:
-        """Let `limiter` take a step towards a goal, see there, or brake if it could not stop inside after that step.
+        """Step `limiter` towards a goal, see `JointLimiter.step`, or brake if it could not stop inside after that step.
 
         A tool that is outside may come back, but not move further away.
         """
@@ -68,13 +68,13 @@ class _Workspace:
 
 
 class Goals:
-    """Turns the actions of a policy into goals of the joints, one control period after the other."""
+    """Turns the actions of a policy into joint goals, one per control period."""
 
     def __init__(self, spec: Spec, limits: JointLimits, box: tuple[Point, Point] | None) -> None:
         """Args: of the policy; of the arm; corners of the box for the tool point of Cartesian actions.
 
         Raises:
-            UserError: the actions are none that the arm can execute, or the box cannot be kept.
+            UserError: the arm cannot execute such actions, or cannot be kept in the box.
         """
         model = spec.require_robot("deployment")
         if len(limits.joints) != len(model.joints):
@@ -98,10 +98,10 @@ class Goals:
             self.workspace = _Workspace(controller.arm.forward, controller.low, controller.high)
 
     def of(self, actions: Array, observed: float, anchor: Array) -> list[Waypoint]:
-        """Return the goals of actions (k, D); the first one begins at the time of the observation (UserError: the
-        actions have another shape or are not finite).
+        """Return the goals of actions (k, D); the first one begins at the time of the observation.
 
         Cartesian actions are relative to the last goal, the first to the joints `anchor` (J,); joint positions are not.
+        Raises a UserError if the actions have another shape or are not finite.
         """
         if actions.ndim != 2 or not len(actions) or actions.shape[1] != len(self._spec.action):
             raise UserError(f"the policy returned actions of the shape {actions.shape}")
@@ -122,7 +122,7 @@ class Motion:
     """The commanded state of an arm: it moves along a schedule, and brakes without one."""
 
     def __init__(self, limits: JointLimits, tick: float, period: float, workspace: _Workspace | None) -> None:
-        """Args: limits of the joints; time between commands [s]; of an action [s]; box of the tool point, if any."""
+        """Args: joint limits; time between commands [s]; duration of an action [s]; box of the tool point, if any."""
         self.limiter, self.tick = JointLimiter(limits, tick), tick
         self._workspace, self._period = workspace, period
         self.schedule = Schedule[Waypoint](period)
@@ -151,7 +151,7 @@ class Motion:
         self._sent, self._sent_valid = None, False
 
     def follow(self, plan: list[Waypoint], position: Array | None = None) -> None:
-        """Replace what is planned; the first goal is approached from the commanded position, or from another (J,)."""
+        """Replace the plan; its first goal is approached from the commanded position, or from `position` (J,)."""
         if position is not None:
             self.limiter.position, self._sent = np.array(position, float), None
         self.schedule, self._sent_valid = Schedule[Waypoint](self._period), False
@@ -204,7 +204,7 @@ class Motion:
     def ahead(self, command: Command, now: float, longest: float = math.inf) -> list[Command]:
         """Return the trajectory from this command to rest, which the arm follows until it is sent another one.
 
-        The next command goes on from where the arm is on it by then, though that tick is late. Args: as of `horizon`.
+        The next command continues from where the arm is on it by then, even if that tick is late. Args: as `horizon`.
         """
         ahead = [command, *self.horizon(now, longest)]
         self._sent = now, [self._before, *ahead]
@@ -213,7 +213,7 @@ class Motion:
     def _recall(self, since: float, ahead: list[Command], now: float) -> None:
         """Set the commanded state from the trajectory `ahead`, sent at `since`: the arm follows that anyway.
 
-        It is that of this tick while the trajectory is valid, else that of the previous tick, because a step follows.
+        It is the state of this tick while the trajectory is valid, else of the previous one, because a step follows.
         """
         ticks = min(max(round((now - since) / self.tick, 6) + self._sent_valid, 0.0), len(ahead) - 1.0)
         before, after, share = ahead[math.floor(ticks)], ahead[math.ceil(ticks)], ticks % 1

@@ -1,4 +1,4 @@
-"""Observations out of images and joint states that arrive one by one, for a policy and for the import of bags. No ROS.
+"""Observations from images and joint states that arrive one by one, for a policy and for the import of bags. No ROS.
 
 All times are seconds on one clock. Shapes: J joints, P state components.
 """
@@ -16,7 +16,7 @@ from vla.spec import Array, Observation, Spec
 
 EARLY_SHARE = 0.25  # share of a control period by which an image may precede the next planned observation
 HISTORY = 1.0  # duration of the history of joint states [s]
-OLDEST = 10.0  # age from which on a time stamp is taken for one of another clock [s]
+OLDEST = 10.0  # age above which a time stamp is taken for that of another clock [s]
 MAX_SKEW = 0.05  # largest difference between the time stamps of one set of images [s]
 
 
@@ -86,7 +86,7 @@ class Observer:
         return {camera: self._newest[camera][1] for camera in self._spec.cameras}
 
     def image_problem(self, now: float, max_age: float) -> str:
-        """Describe what is missing, older than `max_age` [s] or has not matched for so long; empty if nothing is."""
+        """Describe an image that is missing or older than `max_age` [s], or images unmatched for so long; else ""."""
         for camera in self._spec.cameras:
             if camera not in self._newest:
                 return f"no image of the camera {camera} yet"
@@ -102,7 +102,7 @@ class Observer:
         return float(np.ptp(recent, axis=0).max()) if recent else 0.0
 
     def due(self, after: float, earliest: float) -> float | None:
-        """Return when the newest images were taken, if they match, later than `after` and about from `earliest` on."""
+        """Return when the newest images were taken; None unless they match, after `after`, about from `earliest` on."""
         taken, early = self.taken_at, EARLY_SHARE / self._spec.control_hz
         return None if taken is None or taken <= after or taken < earliest - early else taken
 

@@ -1,4 +1,4 @@
-"""The ONNX programs of a trained policy, to run without this project, or in its place."""
+"""The ONNX programs of a trained policy, to run without this project, or in place of the model."""
 
 # T frames of history, N tokens per frame, E width of a token, L tokens of an instruction, k action chunk, D components
 
@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 import onnxruntime
-import onnxscript  # noqa: F401  # of `torch.onnx.export`
+import onnxscript  # noqa: F401  # needed by `torch.onnx.export`
 import torch
 from filelock import FileLock
 from torch import Tensor, nn
@@ -62,13 +62,12 @@ class Program(nn.Module):
 
 
 class OnnxPolicy(Policy):
-    """A policy on the CPU that encodes frames and predicts actions with the ONNX programs of its model (UserError: the
-    model cannot be exported).
+    """A policy on the CPU that encodes frames and predicts actions with the ONNX programs of its model.
 
     The programs are exported once and kept in `folder`, below a digest of code, options and weights of the model:
     `act.onnx`, `encode.onnx` if the model caches tokens of past frames, and `program.json` with their inputs. They
     differ from the model by at most a thousandth of the range of an action, on an episode of noise, return no
-    probabilities, and take one observation at a time.
+    probabilities, and take one observation at a time. Raises a UserError if the model cannot be exported.
     """
 
     def __init__(self, folder: Text | Path, *, model: Model, spec: Spec) -> None:
@@ -87,8 +86,8 @@ class OnnxPolicy(Policy):
 
 
 def write_programs(policy: Policy, folder: Path) -> None:
-    """Write the programs of a policy, on the CPU and not compiled, and `program.json` into a new folder, atomically
-    (UserError: the output of a program differs from the model's)."""
+    """Write the programs of a policy, on the CPU and not compiled, and `program.json` into a new folder, atomically.
+    Raises a UserError if the output of a program differs from the model's."""
     span = torch.tensor(np.subtract(policy.spec.high, policy.spec.low), dtype=torch.float32)
     report: dict[str, Any] = {"model": type(policy.model).__name__, "spec": policy.spec.to_dict()}
     with atomic_path(folder) as draft:
@@ -134,7 +133,7 @@ def inputs_of(batch: Batch) -> Inputs:
 
 
 def capture(program: Program, inputs: Inputs) -> ExportedProgram:
-    """Trace a program as one graph for instructions of any length; raise a UserError if it computes elsewhere."""
+    """Trace a program as one graph for instructions of any length; raise a UserError if that fails."""
     model = program.model
     lengths = {model.text.tokenize([instruction]).shape[1] for instruction in INSTRUCTIONS}
     text = {1: Dim.DYNAMIC} if len(lengths) > 1 else {}

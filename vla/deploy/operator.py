@@ -1,4 +1,4 @@
-"""What a person does with running nodes: instructs, resumes and hands over the agent, starts a simulator's episodes."""
+"""Operation of running nodes: instruct, resume and hand over the agent, and start the simulator's episodes."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ AGENT, SIMULATOR = "/vla_agent", "/vla_simulator"
 
 
 class Operator:
-    """Calls services of the agent and the simulator (UserError: a node is not there, does not respond, refuses or has
-    exited, in all methods).
+    """Calls services of the agent and the simulator. All methods raise a UserError if a node is missing, does not
+    respond, refuses or has exited.
 
     Args:
         node: calls them; it is spun here.
@@ -107,9 +107,9 @@ class Operator:
         _require(self.call(SetBool, f"{AGENT}/hand_over", SetBool.Request(data=to_person)))
 
     def next_episode(self, reset: bool = True) -> str:
-        """Start the simulator's next episode, or only restart the agent, if there is one; it then waits to be told.
+        """Start the simulator's next episode, unless `reset` is False, and restart the agent, if it is active.
 
-        Returns the simulator's description of the episode.
+        The agent then waits for an instruction. Returns the simulator's description of the episode; "" without `reset`.
         """
         client = self.node.create_client(ChangeState, f"{AGENT}/change_state")
         there = client.wait_for_service(SETTLED)

@@ -25,7 +25,7 @@ RESERVE = 256 << 20  # space on a disk that is left to finish a bag [bytes]
 
 
 class BagRecorder:
-    """Writes the messages of every topic to a bag until `close`, also of topics that appear later."""
+    """Writes the messages of every topic of a standard type to a bag until `close`, also of later topics."""
 
     def __init__(self, node: Any, folder: Path) -> None:
         """Args: the node that subscribes, which the caller spins; the folder of the bag, which must not exist.
@@ -61,7 +61,7 @@ class BagRecorder:
             if topic in self._known or package not in MESSAGE_PACKAGES:
                 continue
             self._known.add(topic)
-            if kind not in message_types().fielddefs:  # of another distribution of ROS, or of anybody's making
+            if kind not in message_types().fielddefs:  # of another ROS distribution, or a custom type
                 self._node.get_logger().warning(f"{shorten(topic)} is not recorded: its type is {shorten(kind)}")
                 continue
             offered = [info.qos_profile.durability for info in self._node.get_publishers_info_by_topic(topic)]

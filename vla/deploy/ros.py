@@ -37,7 +37,7 @@ def split_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
     return [*argv[:start], *argv[end + 1 :]], list(argv[start:end])
 
 
-FAST_DDS = "rmw_fastrtps"  # first part of the names of its middleware
+FAST_DDS = "rmw_fastrtps"  # prefix of the names of its RMW implementations
 Reach = Literal["loopback", "localhost", "site"]
 NETWORKS = {"loopback": "SYSTEM_DEFAULT", "localhost": "LOCALHOST", "site": "SUBNET"}  # → ROS_AUTOMATIC_DISCOVERY_RANGE
 

@@ -46,13 +46,13 @@ class Tracking:
     """Compares an arm with its commands."""
 
     def __init__(self, safety: Safety, follows_positions: bool) -> None:
-        """Args: limits of the error; whether the arm goes where the commands say, else there is no error."""
+        """Args: limits of the error; whether the arm follows the commands, else errors are ignored."""
         self._safety, self._follows_positions = safety, follows_positions
         self._away_since: float | None = None
         self._lost = False  # True if the newest joint state was too old at the last check
 
     def check(self, motion: Motion, newest: Measured, now: float) -> tuple[bool, bool]:
-        """Return whether the arm is off its commands for too long, and whether it was moved while nobody saw it."""
+        """Return whether the arm is off its commands for too long, and whether it moved while no joint state came."""
         error = float(np.abs(motion.limiter.position - newest.joints).max())
         away = motion.started and self._follows_positions and error > self._safety.tracking
         was_lost, self._lost = self._lost, now - newest.at > self._safety.joints_age

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from vla.policy import Policy
 
 FULL = "{} clients are connected: raise deploy.connections, or lower their cluster.workers\n"
-PATIENCE = 3.0  # with clients that open or close a connection [s]
-WARNINGS = 20  # of what clients do, in a minute
+PATIENCE = 3.0  # longest opening or closing of a connection by a client [s]
+WARNINGS = 20  # most warnings about clients in a minute
 INVALID, TOO_BIG, INTERNAL = 1007, 1009, 1011  # WebSocket close codes: invalid data, too large, error in the server
 
 log = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ Port = Annotated[int, Ge(0), Le(65535)]  # 0: any free one
 
 @dataclass(kw_only=True)
 class PolicyServer:
-    """The policy behind openpi's protocol (UserError: other machines could connect without a key).
+    """The policy behind openpi's protocol. Raises a UserError if other machines could connect without a key.
 
     Attributes:
         host, port: address to listen at.
@@ -112,7 +112,7 @@ class Service:
 
     @contextmanager
     def in_thread(self) -> Iterator[str]:
-        """Serve in a thread of its own within the context, which is entered with the URL."""
+        """Serve in a thread of its own within the context; yield the URL."""
         with asyncio.Runner() as runner, ThreadPoolExecutor(1, "server") as thread:
             loop, url, stop = runner.get_loop(), queue.Queue[str](), asyncio.Event()
 
@@ -132,7 +132,7 @@ class Service:
 
     @asynccontextmanager
     async def _listening(self) -> AsyncIterator[str]:
-        """Serve within the context, which is entered with the URL once the first client can be answered."""
+        """Serve within the context; yield the URL once the first client can be answered."""
         settings, policy = self._settings, self._policy
         options: dict[str, Any] = {"compression": None, "max_size": settings.largest_message, "max_queue": 1}
         options |= {"origins": [None, *settings.origins], "process_request": self._answer_request}  # programs have none
@@ -227,9 +227,9 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
     """Describe the policy to a client: layouts, units and bounds, and how to use its chunks.
 
     `horizon` is the length of a chunk, of which a client executes the first `execute` actions; a policy with a
-    `history` of several frames wants to see every frame, so that the client sends an observation at every step. With
-    `chunking`, an observation may have the plan that is `running`: its next `actions` (n, D), and how many of them, the
-    `delay`, will be over when the answer arrives.
+    `history` of several frames needs every frame, so the client must send an observation at every step. With
+    `chunking`, an observation may have the plan that is `running`: its remaining `actions` (n, D), and `delay`, the
+    number of them that will have been executed when the answer arrives.
     """
     spec = policy.spec
     bounds = {"low": np.array(spec.low, np.float32), "high": np.array(spec.high, np.float32)}

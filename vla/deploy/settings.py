@@ -26,7 +26,7 @@ FOLLOW = "follow_joint_trajectory"  # the command that is an action
 
 @dataclass(frozen=True)
 class Topics:
-    """Names of the topics, before remapping (UserError: a name is not valid in ROS)."""
+    """Names of the topics, before remapping. Raises a UserError if a name is not valid in ROS."""
 
     images: dict[str, str]  # camera → topic of sensor_msgs/Image, or, ending in /compressed, CompressedImage
     joint_states: str  # sensor_msgs/JointState
@@ -79,7 +79,7 @@ class FrankaGripper:
 
     open: Positive  # distance of the fingers [m]
     closed: NonNegative
-    epsilon: tuple[NonNegative, NonNegative]  # a grasp holds something so far below or above `closed` [m]
+    epsilon: tuple[NonNegative, NonNegative]  # tolerance of a grasp below and above `closed` [m]
     speed: Positive  # [m/s]
     force: Positive  # [N]
 
@@ -111,7 +111,7 @@ def action_class(package: str, name: str) -> Any:
 
 @dataclass(kw_only=True)
 class NodeSettings:
-    """What both nodes need.
+    """Settings of both nodes.
 
     Attributes:
         robot: the joints of the arm and their limits.
@@ -152,7 +152,7 @@ class PolicySettings(NodeSettings):
 
     @property
     def moves_gripper(self) -> bool:
-        """Whether commands of a gripper go anywhere."""
+        """Whether the gripper commands of a policy are sent to a topic or an action server."""
         positions = self.robot.fingers and (self.command == "joint_state" or self.topics.gripper)
         return bool(self.gripper or positions)
 

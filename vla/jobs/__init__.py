@@ -1,4 +1,4 @@
-"""Jobs, `job=…`: the requirements of each, which a config is checked for, and the module that does it.
+"""Jobs, `job=…`: the requirements that a config is checked against, and the module that runs each job.
 
 `collect`, `train` and `evaluate` are stages of a pipeline: each first runs the earlier stages whose product is missing.
 """
@@ -46,9 +46,9 @@ JOBS = {
 
 
 def find(name: str) -> Job:
-    """Return the requirements of a job: one of `JOBS`, or `JOB` in the module that `name` is, of a trusted package.
+    """Return the requirements of a job: one of `JOBS`, or `JOB` of the module `name` in a trusted package.
 
-    There is a UserError if there is no such job, or its package is not trusted.
+    Raises a UserError if there is no such job, or its package is not trusted.
     """
     if name in JOBS:
         return JOBS[name]
@@ -65,7 +65,7 @@ def find(name: str) -> Job:
 
 
 def builds_world(experiment: Experiment) -> bool:
-    """Return whether a job simulates: a resumed run has its world, and a training on a store needs none."""
+    """Return whether a job builds a new world: a resumed run keeps its own, and training on a store needs none."""
     groups, settings = find(experiment.settings.job).needs(experiment.nodes), experiment.settings
     if settings.resume is not None or (settings.job == "train" and Path(experiment.collect.folder).exists()):
         return False
@@ -77,7 +77,7 @@ def builds_world(experiment: Experiment) -> bool:
 def run(experiment: Experiment) -> float | None:
     """Run the job of an experiment; evaluation returns the success rate, which sweeps maximise.
 
-    There is a UserError if the config compiles a model, and this machine cannot; or an error of the job.
+    Raises a UserError if the config compiles a model and this machine has no compiler, and the errors of the job.
     """
     name = experiment.settings.job
     groups = find(name).needs(experiment.config)

@@ -24,7 +24,7 @@ def run(experiment: Experiment) -> None:
 def demonstrations(experiment: Experiment) -> EpisodeStore:
     """Return the episode store of an experiment, limited to `collect.episodes`; collect missing episodes.
 
-    There is a UserError if the store has episodes of another experiment, or collection fails.
+    Raises a UserError if the store has episodes of another experiment, or collection fails.
     """
     wanted = experiment.collect
     if wanted.seed + wanted.episodes > FIRST_SEED:
@@ -55,7 +55,7 @@ def demonstration_spec(experiment: Experiment) -> Spec:
 def complete_store(experiment: Experiment) -> EpisodeStore | None:
     """Return the episode store of an experiment if it has enough episodes.
 
-    There is a UserError if the store has another task, expert or first seed, or images with other losses.
+    Raises a UserError if the store has another task, expert, first seed, or loss of image compression.
     """
     wanted = experiment.collect
     if not is_store(Path(wanted.folder)):

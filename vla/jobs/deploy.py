@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 def run(experiment: Experiment) -> None:
     """Run the deployment until done or interrupted; report a measured success rate like an evaluation.
 
-    There is a UserError if an episode of the deployment may have been trained on or selected the weights, or if one
+    Raises a UserError if the policy may have been trained or selected on an episode of the deployment, or if an episode
     ended in an error.
     """
     seed, episodes = (at(experiment["deploy"], key, None) for key in ("simulator.seed", "episodes"))

@@ -62,7 +62,7 @@ NETWORK = Group("evaluate.networks", ("vla.rollouts.realtime.Network",))
 
 
 def run(experiment: Experiment) -> float | None:
-    """Measure the success rate, or open-loop errors; a UserError if an episode ended in an error.
+    """Measure the success rate, or open-loop errors; raise a UserError if an episode ended in an error.
 
     The result is None in all but the first process of a training, and if no episodes are left to evaluate on.
     """
@@ -92,8 +92,8 @@ def _trained(experiment: Experiment) -> Path | None:
 def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
     """Return the success rate of a policy, or of the agent of the config.
 
-    A finished evaluation of a policy is kept, and of an unfinished one the episodes that were played. If an episode
-    ended in an error the report is written and contains it, then a UserError is raised.
+    A finished evaluation of a policy is not repeated, and an unfinished one continues after the episodes that were
+    played. If an episode ended in an error, a UserError is raised after the report, which contains it, is written.
     """
     output, identity = experiment.output, _identity(experiment, checkpoint)
     weights = identity["weights"]
@@ -101,7 +101,7 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
         _renew_page(output)
         return known
     statements, conclusions = _statements(experiment), list[str]()
-    _ = experiment.origin  # of the code that is evaluated, not of later changes
+    _ = experiment.origin  # determine it now, before the code may change
     try:
         with Played(output, identity) as played:
             with policy_for_workers(experiment, checkpoint) as make_policy:
@@ -123,7 +123,7 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
 
 
 def _renew_page(output: Path) -> None:
-    """Write the page of a run if it is older than the report: a process was killed between, or had no room."""
+    """Write the page of a run if it is missing or older than the report, as after a kill or a full disk."""
     page = output / PAGE
     if not page.is_file() or page.stat().st_mtime < (output / REPORT).stat().st_mtime:
         with warn_on_error(page):
@@ -141,7 +141,7 @@ def _identity(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]
 
 @contextmanager
 def policy_for_workers(experiment: Experiment, checkpoint: Path | None) -> Iterator[AgentFactory | None]:
-    """Enter with the factory of the policy in a checkpoint, which runs where `cluster.policy` says."""
+    """Yield the factory of a checkpoint's policy, which runs where `cluster.policy` says; None without a checkpoint."""
     if checkpoint is None:
         yield None
         return
@@ -160,7 +160,7 @@ def _is_shared(experiment: Experiment) -> bool:
 def _conditions(experiment: Experiment, make_agent: AgentFactory) -> dict[str, tuple[EnvironmentFactory, AgentFactory]]:
     """Return condition → world and agent: the training condition, then those that change its world or its agent.
 
-    Other agents are the same one without a modality or at the other end of a network, and the nearest demonstration.
+    The other agents are this one without a modality or at the other end of a network, and the nearest demonstration.
     """
     wanted, world = experiment.evaluate, experiment.make_environment()
     found = {IN_DISTRIBUTION: (world, make_agent)}
@@ -182,7 +182,7 @@ def _play(
     """Return condition → report on the same seeds; only the first, the training condition, is recorded.
 
     Episodes in `played` are not played again; others are added to it. With `evaluate.until` the first condition stops
-    when all statements are clear; every other one has the seeds of the first, and stops when its difference is clear.
+    once all statements are decided; the others play the seeds of the first, and stop once their difference is decided.
     """
     wanted, recordings = experiment.evaluate, experiment.output.resolve() / RECORDINGS
     make_agent, make_recorder = experiment.make_agent() or make_policy, experiment.make_recorder(recordings)
@@ -219,8 +219,8 @@ def _play(
 def require_possible(experiment: Experiment) -> None:
     """Check, before any work, that the evaluation can be completed.
 
-    There is a UserError if there is no such run to compare with, nothing to decide, no such network or store, or no
-    world to change; or its episodes selected the weights.
+    Raises a UserError if the run to compare with or a store is missing, there is nothing to decide, a network or a
+    condition is impossible, or the episodes selected the weights or are not distinct.
     """
     wanted, settings = experiment.evaluate, experiment.settings
     for name in (settings.checkpoint, settings.pretrained):
@@ -241,12 +241,12 @@ def require_possible(experiment: Experiment) -> None:
     output = Path(settings.output)  # not created yet
     if settings.job != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
         raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
-    # Worlds take time to compile: of conditions that change the same arguments one is built; all nodes are checked.
+    # Worlds take time to compile: one is built for all conditions that change the same arguments; nodes were checked.
     kinds = {frozenset(changes): (name, changes) for name, changes in reversed(wanted.changes.items())}
     for name, changes in kinds.values() if experiment.playable else ():
         try:
             with closing(experiment.make_environment(changes)()) as world, world.blind():
-                world.reset(wanted.seed)  # such as with more blocks than colours
+                world.reset(wanted.seed)  # fails, for instance, with more blocks than colours
         except ValueError as error:
             raise UserError(f"condition {name} of the evaluation: {error}") from error
     if hasattr(experiment.kind("task"), "distinct"):
@@ -267,7 +267,7 @@ def _require_distinct(condition: str, world: Any, wanted: Evaluation) -> None:
 
 
 def _statements(experiment: Experiment) -> list[Statement]:
-    """Build the statements to decide; a UserError if there is no such run to compare with, or nothing to decide."""
+    """Build the statements to decide; raise a UserError if the run to compare with is missing, or nothing to decide."""
     wanted, found = experiment.evaluate, list[Statement]()
     if wanted.bar is not None:
         found.append(AgainstBar(wanted.bar))
@@ -287,7 +287,7 @@ def _statements(experiment: Experiment) -> list[Statement]:
 
 
 def _against(experiment: Experiment, run: str) -> AgainstRun:
-    """Build the comparison with another run; a UserError if it has no such episodes."""
+    """Build the comparison with another run; raise a UserError if it has no report or no episode in common."""
     report = require_run(Path(run)).report
     if report is None:
         raise UserError(f"evaluate.against={run} has no report.json to compare with: evaluate that run first")

@@ -1,4 +1,4 @@
-"""`job=export`: export the demonstrations to another format."""
+"""`job=export`: export demonstrations or a policy to another format."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 def run(experiment: Experiment) -> None:
     """Export demonstrations or a policy, depending on the exporter.
 
-    There is a UserError if the exporter needs a policy, and no checkpoint is given.
+    Raises a UserError if the exporter needs a policy, and no checkpoint is given.
     """
     exporter = experiment.build("export")
     if getattr(exporter, "of_policies", False):

@@ -42,7 +42,7 @@ EPISODES = "episodes"  # the store in the folder of a round
 def run(experiment: Experiment) -> float:
     """Improve a policy in rounds and return its success rate; finished rounds, and parts of one, are kept.
 
-    There is a UserError if the expert cannot label, seeds are not fresh, or the folder has a round of another policy.
+    Raises a UserError if the expert cannot label, seeds are not new, or the folder has a round of another policy.
     """
     seeds = _require_possible(experiment)
     known = complete_store(experiment)
@@ -72,7 +72,7 @@ def _improved(experiment: Experiment, seeds: range) -> float:
 
 
 def _save_config(experiment: Experiment) -> None:
-    """Save the config for `resume=`; a UserError if the folder has rounds of another training, or of another length."""
+    """Save the config for `resume=`; raise a UserError if the folder has rounds of another training or length."""
     saved = read_run(experiment.output).config
     if saved.get("job") == "improve":
         # Later trainings continue the earlier ones, which must not get another length.
@@ -80,12 +80,12 @@ def _save_config(experiment: Experiment) -> None:
         lengths = [f"trainer.{name}" for name in LENGTHS] if experiment.pretrained is None else []
         further = (*lengths, "improve.steps") if begun else ()
         require_identity(saved, experiment.config, experiment.output, further)
-    if saved != experiment.config:  # else its date would tell that the rounds began again
+    if saved != experiment.config:  # else a new date would suggest that the rounds began again
         save_config(experiment.output, experiment.config, experiment.changes)
 
 
 def _require_possible(experiment: Experiment) -> range:
-    """Return the seeds of all rounds; a UserError if they are of evaluation, or the rounds cannot be played."""
+    """Return the seeds of all rounds; raise a UserError if evaluation reserves them, or the rounds cannot be played."""
     require_possible(experiment)
     asked = experiment.options(Rounds)
     seeds = asked.seeds
@@ -111,7 +111,7 @@ def _require_possible(experiment: Experiment) -> range:
 
 
 def _require_further_episodes(experiment: Experiment, policy: Path) -> None:
-    """Raise a UserError if the policy was trained on further stores, such as rounds, that nothing is said about."""
+    """Raise a UserError if the policy was trained on further stores, such as rounds, and `collect.more` is not set."""
     further = at(read_policy(policy).config, "collect.more", None)
     if isinstance(further, list) and further and experiment.collect.more is None:
         names = ",".join(map(str, further))
@@ -153,7 +153,7 @@ def _labelled(experiment: Experiment, checkpoint: Path, folder: Path, seed: int)
 
 
 def _round(experiment: Experiment, checkpoint: Path, folder: Path, stores: Sequence[Path]) -> Experiment:
-    """Return the training of a round: from the weights of the one before, on demonstrations and all rounds so far."""
+    """Return the experiment that trains in a round, from the last weights, on demonstrations and all rounds so far."""
     steps, batches = experiment.options(Rounds).steps, experiment["trainer"]["accumulate_grad_batches"]
     more = [*(experiment.collect.more or ()), *map(str, stores)]
     return experiment.with_values(

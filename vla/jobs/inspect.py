@@ -39,7 +39,7 @@ def run(experiment: Experiment) -> None:
 def inspect_store(wanted: Inspection) -> None:
     """Verify and describe a store, or a new one made by merging, filtering or repair.
 
-    There is a UserError if the store cannot be read or made, or, after its intact episodes are described, is damaged.
+    Raises a UserError if the store cannot be read or made, or, after its intact episodes are described, is damaged.
     """
     findings = verify_store(EpisodeStore(_chosen(wanted), damaged=True))
     show(store_table(findings))
@@ -74,7 +74,7 @@ def replay_episode(
 ) -> None:
     """Replay the actions of a stored episode and compare the states.
 
-    There is a UserError if there is no such episode, or its store does not contain its task, or another robot's.
+    Raises a UserError if there is no such episode, its store lacks the task, or the task now has another spec.
 
     If `recorded`, write `episode-SEED.rrd`: the episode in the 3-D scene of the replay.
 

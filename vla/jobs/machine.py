@@ -49,7 +49,7 @@ def computes_on_cpu(device: str | None) -> bool:
 def require_compiler(config: Mapping[str, Any], groups: Container[str]) -> None:
     """Raise a UserError if a job that builds `groups` compiles a model, and this machine has no compiler.
 
-    On a CPU PyTorch calls one of C++, on a GPU Triton calls one of C; a package of the former brings the latter.
+    On a CPU PyTorch calls a C++ compiler, on a GPU Triton calls a C compiler, which the packages of the former include.
     """
     known = [os.environ["CXX"]] if "CXX" in os.environ else ["g++", "clang++"]
     for name in ("learner", "policy"):

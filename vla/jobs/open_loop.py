@@ -41,7 +41,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     output, folder = experiment.output, Path(experiment.collect.folder)
     facts: dict[str, Any] = {**experiment.settings.chosen, "origin": asdict(experiment.origin)}
     fraction = _held_out(experiment, checkpoint)  # before an import
-    known = checkpoint is not None and is_store(folder)  # else an import is compared with its dataset
+    known = checkpoint is not None and is_store(folder)  # else an earlier import is compared with its dataset
     store = EpisodeStore(folder, experiment.collect.episodes) if known else demonstrations(experiment)
     if checkpoint is None:
         make_agent: Any = experiment.make_agent()
@@ -73,7 +73,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
 
 
 def _held_out(experiment: Experiment, checkpoint: Path | None) -> float:
-    """Return the share of episodes that training holds out, or held out; a UserError if there are none."""
+    """Return the share of episodes that training holds out, or held out; raise a UserError if there are none."""
     fraction, whose = experiment["data"]["validation_fraction"], "a training would be"
     if checkpoint is not None:
         saved, whose = read_policy(checkpoint), f"{checkpoint} was trained"
@@ -112,7 +112,7 @@ def _require_trained_on(store: EpisodeStore, more: Sequence[str], checkpoint: Pa
 
 
 def _measure(experiment: Experiment, store: EpisodeStore, fraction: float, policy: Any) -> OpenLoop:
-    """Return the errors on the held-out episodes; a UserError if there are none, or no others."""
+    """Return the errors on the held-out episodes; raise a UserError if there are none, or no others."""
     parts: dict[bool, list[Entry]] = {True: [], False: []}
     for entry in store.episodes:
         parts[held_out(entry.recording, fraction)].append(entry)

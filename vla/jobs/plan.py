@@ -29,12 +29,12 @@ NOTE = (
 
 
 def run(experiment: Experiment) -> None:
-    """Print a table, with a row per way to compare."""
+    """Print a table with a row per kind of comparison."""
     show(plan_table(experiment.options(Power)))
 
 
 def plan_table(asked: Power) -> Table:
-    """Tabulate numbers of episodes, of each policy if there are two; a UserError if the rates cannot be told apart."""
+    """Tabulate numbers of episodes, for each policy if there are two; raise a UserError if the rates are equal."""
     one, other = asked.rates
     if one == other:
         raise UserError(f"plan.rates={asked.rates} are equal: no number of episodes tells them apart")
@@ -54,7 +54,10 @@ def plan_table(asked: Power) -> Table:
 
 
 def _shares(asked: Power, one: float, other: float) -> dict[str, float]:
-    """Return how two policies differ → the share of the episodes in which only one succeeds; by default its limits."""
+    """Return case → share of the episodes in which only one of two policies succeeds.
+
+    Unless it is given or measured, there are two cases: independent failures, and the smallest possible share.
+    """
     if asked.runs and asked.discordant is not None:
         raise UserError("plan.discordant is measured on plan.runs: omit one of the two")
     share = _measured(asked.runs) if asked.runs else asked.discordant

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from vla.runs.sweep import SweepRow
 
 LOCK = ".lock"  # in the folder of a sweep
-EVERY = 10  # cells between two tables once there are so many, because a table reads all of them
+EVERY = 10  # up to so many ended cells each one updates the table, then every tenth, because it reads all cells
 
 
 class SweepTable(Callback):
-    """Writes `sweep.html`, `sweep.md` and `sweep.png` after the first cells, then after some, and at the end."""
+    """Writes `sweep.html`, `sweep.md` and `sweep.png` after the first cells, then every `EVERY`, and at the end."""
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Remove an earlier error of the cell."""
@@ -47,7 +47,7 @@ class SweepTable(Callback):
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Print the table of the sweep, and name its page; end the process with an error if there are no cells.
 
-        After a cell failed Hydra does not call this, and `vla.run` writes the table.
+        If a cell failed, Hydra does not call this, and `vla.run` writes the table.
         """
         from vla.reports.comparison_page import SWEEP, results_table  # imports matplotlib
         from vla.runs.sweep import OVERRIDES, cells

@@ -48,7 +48,7 @@ from vla.training.trainer import end_wandb, explain_memory_errors, make_trainer,
 
 log = logging.getLogger(__name__)
 
-COARSE = 0.02  # mean error of actions as tokens, as a share of their range, of which is warned
+COARSE = 0.02  # mean rounding error of tokens, as a share of an action's range, above which a warning is logged
 
 
 def run(experiment: Experiment) -> None:
@@ -59,7 +59,7 @@ def run(experiment: Experiment) -> None:
 def train(experiment: Experiment) -> Path | None:
     """Train, and return the folder of the policy that validation selects; None in all but the first process.
 
-    An unfinished training in the output folder is resumed; a finished one is kept. There is a UserError if the output
+    An unfinished training in the output folder is resumed; a finished one is kept. Raises a UserError if the output
     folder has another training, or this one cannot start.
     """
     output = experiment.output
@@ -67,7 +67,7 @@ def train(experiment: Experiment) -> Path | None:
     if chosen is not None:
         return chosen if first_process() else None
     first = _trained(experiment, last)
-    gc.collect()  # cycles keep the trainer and the model, for whose memory a next training or an evaluation has a use
+    gc.collect()  # reference cycles hold trainer and model, whose memory a later training or evaluation needs
     if not first:
         return None
     log.info("the policy is %s", output / POLICY)
@@ -95,12 +95,12 @@ def _trained(experiment: Experiment, last: Path | None) -> bool:
             logging.getLogger("vla").setLevel(logging.WARNING)  # only the first process logs
         _fit(experiment, last, trainer, graceful_stop)
         if torch.distributed.is_available() and torch.distributed.is_initialized():
-            torch.distributed.destroy_process_group()  # together: at their exit the others would wait for the first one
+            torch.distributed.destroy_process_group()  # at once: at exit the other processes would wait for the first
         return trainer.is_global_zero
 
 
 def warn_of_length(experiment: Experiment) -> None:
-    """Log a warning of what never happens in a training of so many steps."""
+    """Log a warning for every part of the schedule that a training of this length never reaches."""
     learner, trainer = experiment["learner"], experiment["trainer"]
     steps, interval = trainer["max_steps"], trainer["val_check_interval"]
     if steps in (None, -1):
@@ -155,7 +155,7 @@ def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_s
 
 
 def _windows(experiment: Experiment, store: EpisodeStore, model: Model, trainer: Trainer) -> WindowDataModule:
-    """Return the windows of a store for a model, and draw some; a UserError if there are less than a batch."""
+    """Return the windows of a store for a model, and draw some; raise a UserError if there are fewer than a batch."""
     data = experiment.data(store, model.history, model.chunk, model)
     data.setup()
     if data.batch_size > len(data.training_windows):
@@ -175,7 +175,7 @@ def _windows(experiment: Experiment, store: EpisodeStore, model: Model, trainer:
 
 
 def _save(trainer: Trainer, output: Path) -> None:
-    """Save the policy in training, or a better one, and then the checkpoint, whose `finished` says that it is there."""
+    """Save the policy, or a better earlier one, then the checkpoint, whose `finished` says that the policy exists."""
     callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
     (better,) = [each.clearly_better() for each in callbacks if isinstance(each, ClosedLoop)] or [None]
     if better is None:
@@ -187,13 +187,13 @@ def _save(trainer: Trainer, output: Path) -> None:
 
 
 class _Begun(Callback):
-    """Archives the evaluation of a run and saves its config, once its training continues."""
+    """Archives an earlier evaluation in the run's folder, and saves the config, once training starts or continues."""
 
     def __init__(self, experiment: Experiment) -> None:
         self._experiment = experiment
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """All state is restored."""
+        """Do so here, because all state is restored by now."""
         if trainer.is_global_zero:
             training = read_training(self._experiment.output)
             archive_evaluation(self._experiment.output, training.steps if training else 0)
@@ -201,7 +201,7 @@ class _Begun(Callback):
 
 
 def _warn_of_tokenization(model: Model, stores: list[EpisodeStore]) -> None:
-    """Warn of actions that lose much as tokens, in the first store, or are beyond the tokenizer's bounds, in each."""
+    """Warn if actions lose much precision as tokens, in the first store, or exceed the tokenizer's bounds, in any."""
     for store in stores:
         chunks = store.statistics.chunks(model.chunk)
         if model.uses_tokens and store is stores[0]:
@@ -233,7 +233,7 @@ def _closed_loop(experiment: Experiment) -> ClosedLoop | None:
 def _reported(
     experiment: Experiment, trainer: Trainer, graceful_stop: GracefulStop, learner: Learner, resumed: bool
 ) -> Iterator[None]:
-    """Write the report page and the log summary however training ends, including the runs it resumed from."""
+    """Save result and page of a training however it ends; a resumed one keeps the origins of its earlier parts."""
     output, before, ended = experiment.output, read_training(experiment.output), "done"
     origins = before.origins if before and resumed else []
     origins = origins if experiment.origin in origins else [*origins, experiment.origin]  # of its beginning, and later

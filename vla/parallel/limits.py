@@ -9,7 +9,7 @@ from pathlib import Path
 import psutil
 
 CGROUPS, MEMBERSHIP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
-# Limit, use, and the key of `memory.stat` for the part of it that the kernel drops when memory is needed.
+# Files of limit and usage, and the key in `memory.stat` for the usage that the kernel reclaims when memory is needed.
 MEMORY_FILES = (
     ("memory.max", "memory.current", "inactive_file"),  # version 2
     ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),  # version 1
@@ -17,7 +17,7 @@ MEMORY_FILES = (
 
 
 def cores() -> int:
-    """Return the number of cores that processes may use: those of the affinity, or of the container's quota if fewer.
+    """Return the number of cores that processes may use: the CPU affinity, or the container's quota if it is smaller.
 
     `LOKY_MAX_CPU_COUNT` limits it further.
     """
@@ -35,7 +35,7 @@ def processor() -> str:
 
 
 def free_memory() -> int:
-    """Return the memory [bytes] that is free: in the machine, or in the control group with least.
+    """Return the free memory [bytes] of the machine, or of the control group that has the least.
 
     Containers and batch systems limit memory by control groups.
     """
@@ -48,7 +48,7 @@ def scarce_memory(share: float) -> bool:
 
 
 def memory() -> int:
-    """Return the memory [bytes] of the machine, or of the control group with least."""
+    """Return the memory [bytes] of the machine, or of the control group that has the least."""
     return min(most for most, _ in _limits())
 
 
@@ -71,7 +71,7 @@ def _groups() -> Iterator[Path]:
 
 
 def _number(file: Path) -> int | None:
-    """Return the number in a file; None without one, as where nothing is limited."""
+    """Return the number in a file; None if it holds none, such as the `max` of an unlimited group."""
     try:
         return int(file.read_text())
     except (OSError, ValueError):

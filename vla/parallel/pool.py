@@ -40,7 +40,7 @@ class Cluster:
 
         Args:
             workers: their number; None: one per core.
-            policy: whether a policy runs beside each worker, or here, in this process, once for all of them.
+            policy: "beside" runs a policy in the process of every worker, "here" one for all of them in this process.
         """
         self.workers, self.policy = workers or cores(), policy
 
@@ -87,7 +87,7 @@ class _LazyFuture:
         return self._worker.attempt(self._item)
 
     def cancel(self) -> None:
-        """Do nothing: without `result` nobody begins."""
+        """Do nothing: work starts only in `result`."""
 
 
 class ProcessPool:
@@ -165,7 +165,7 @@ class ProcessPool:
             raise
 
     def _forget(self, process: WorkerProcess) -> None:
-        """Free what is open of a process that has ended; a pool that is left does so for all."""
+        """Release the resources of a process that has ended; a closed pool does so for all processes."""
         with self._lock:
             if not self._closed:
                 self._processes.remove(process)

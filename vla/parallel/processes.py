@@ -22,7 +22,7 @@ GPUS = "nvidiactl", "dxg", "kfd"  # devices of NVIDIA, the same in WSL, and of A
 SECONDS_TO_END = 5.0  # [s] for an idle process to free its resources
 WORKER = "VLA_WORKER"  # environment variable: number of a worker process in its pool
 
-# LP_NUM_THREADS is of Mesa's renderer, which counts only threads beside the calling one.
+# LP_NUM_THREADS is read by Mesa's renderer, which does not count the calling thread.
 THREAD_SETTINGS = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
 
 
@@ -48,7 +48,7 @@ class WorkerProcess:
 
     def __init__(self, make: bytes, number: int) -> None:
         self._connection, there = get_context("spawn").Pipe()
-        # A daemon is ended with this process, even if its pool is never left.
+        # A daemon ends with this process, even if the context of its pool is never left.
         self._process = get_context("spawn").Process(target=_serve, args=(there, make, number), daemon=True)
         self._process.start()
         there.close()  # so that the end of the process ends the connection
@@ -121,10 +121,10 @@ def _serve(connection: Connection, make: bytes, number: int) -> None:
 
 
 def _outcome(function: Callable[..., Any], *arguments: Any) -> bytes:
-    """Call a function; returns its result and its error, with the traceback as a note, pickled."""
+    """Call a function; return (result, error) pickled, with the traceback as a note on the error."""
     try:
         return pickle.dumps((function(*arguments), None))
-    except Exception as error:  # of any kind, that of pickling included: the parent raises it
+    except Exception as error:  # any error, also of pickling: the parent raises it
         told = portable(error)
         told.add_note(f"\nIn the worker process:\n{traceback.format_exc()}")
         return pickle.dumps((None, told))
@@ -152,19 +152,19 @@ def leave_with_parent() -> None:
 
 
 def ease_garbage_collection() -> None:
-    """Let the cyclic garbage collector run seldom, and not at the end of the program.
+    """Make the cyclic garbage collector run rarely, and not at the exit of the program.
 
-    Its passes during imports take a second and free little; those at the end, up to two, free what ends anyway.
+    Its passes during imports take a second and free little. Those at exit take up to two, and the process ends anyway.
     """
     gc.set_threshold(50_000, 20, 100)
     atexit.register(gc.freeze)
 
 
 def spin_briefly() -> None:
-    """Let OpenMP's threads sleep soon where they wait for each other. Call this before PyTorch is imported.
+    """Make OpenMP threads spin only briefly before they sleep. Call this before PyTorch is imported.
 
-    By default they spin for about a millisecond. Where others compute on the same cores, such as a second training,
-    they take these cores from the very threads that they wait for, in every operation.
+    By default they spin for about a millisecond. If another process, such as a second training, uses the same cores,
+    spinning threads take these cores from the very threads that they wait for, in every operation.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # about ten microseconds
 

@@ -25,7 +25,7 @@ CASE = ("second", "minus first", "condition")
 
 
 def read_runs(folders: Sequence[Path]) -> dict[str, Run]:
-    """Return name → run; a UserError if no folder is given, or one twice, or one is no run or has a damaged file."""
+    """Return name → run; raise a UserError if no folder is given, or one twice, or one is no run or is damaged."""
     if not folders:
         raise UserError("name the runs to compare, as in report.runs=[RUN,RUN]")
     runs = [require_run(folder) for folder in folders]
@@ -43,7 +43,7 @@ def rows_of(runs: Mapping[str, Run]) -> list[SweepRow]:
 
 
 def compare(pairs: Iterable[tuple[SweepRow, SweepRow]], margin: float) -> Compared:
-    """Compare pairs of rows under each condition, in which they played in the same world.
+    """Compare pairs of rows under each condition that both played in the same world.
 
     Single trainings are compared on the episodes that both played, by paired tests and in secondary metrics; without
     any, and with several trainings, as independent samples of size `effective_episodes`. Conditions that repeat the
@@ -68,7 +68,7 @@ def _repeats_training_condition(runs: Sequence[Run], condition: str) -> bool:
 
 
 def _compared(one: SweepRow, other: SweepRow, condition: str) -> dict[str, Comparison]:
-    """Compare two rows under a condition, see `compare`; empty in other worlds, or in samples that stopped early."""
+    """Compare two rows under a condition, see `compare`; empty if worlds differ, or samples stopped early."""
     runs = one.runs[0], other.runs[0]
     reports = [run.reports[condition] for row in (one, other) for run in row.runs if condition in run.reports]
     anytime = any(report.anytime for report in reports)
@@ -87,7 +87,7 @@ def _compared(one: SweepRow, other: SweepRow, condition: str) -> dict[str, Compa
 
 
 def remarks(runs: Mapping[str, Run], compared: Compared | None = None) -> dict[str, str]:
-    """Return remark → the runs, by name, that it is about; with comparisons also which pairs have none."""
+    """Return remark → the names of the runs that it concerns; given comparisons, also the pairs that have none."""
     known = {(one, other) for other, one, _ in compared or ()}
     pairs = [] if compared is None else [pair for pair in combinations(runs, 2) if pair not in known]
     versions: dict[str, dict[str, None]] = {}  # library → its versions, in order and without repetition
@@ -134,7 +134,7 @@ def common_episodes(one: Run, other: Run, condition: str) -> list[tuple[Result, 
 def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
     """Return seed → result under a condition, and a key that is equal for equal scene and instruction.
 
-    Of other conditions than the first, and of some worlds, only the config tells what was drawn.
+    For other conditions than the first, and for some worlds, only the config tells what was drawn.
     """
     results, scenes = run.reports.get(condition, Report(())).results, _scenes(run, condition)
     return {each.seed: (each, (each.instruction, each.draws or scenes)) for each in results if each.outcome != ERROR}
@@ -149,6 +149,6 @@ def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
 
 
 def _changes(run: Run, condition: str) -> dict[str, Any] | None:
-    """Return what a condition changes in the task; None if it is another agent's, or unknown."""
+    """Return what a condition changes in the task; None if it changes the agent, or is unknown."""
     evaluate = at(run.report.config if run.report else {}, "evaluate", {})
     return conditions(evaluate.get("conditions", {}), evaluate.get("one_by_one", {})).get(condition)

@@ -31,9 +31,9 @@ FAILURES = 3  # moving pictures per run
 def write_comparison(
     page: Path, title: str, rows: Sequence[SweepRow], compared: Compared, facts: Mapping[str, str]
 ) -> Path:
-    """Write a page on rows and their comparisons, and return its path; a UserError if a moving picture is damaged.
+    """Write a page on rows and their comparisons; return its path. Raises a UserError if a moving picture is damaged.
 
-    Of more runs than there are colours it has neither moving pictures nor the differences of their configurations.
+    With more runs than colours it shows neither their moving pictures nor the differences in their configurations.
     """
     legend, cells = _legend(rows), list[tuple[str, str, Run]]()
     for row in rows:
@@ -72,7 +72,7 @@ def tabulate(folder: Path) -> list[SweepRow]:
 
 
 def results_table(rows: Sequence[SweepRow], folder: Path | None = None) -> Table:
-    """Tabulate success under every condition, and costs, in a page in `folder` also links to the pages of the runs."""
+    """Tabulate success under every condition and costs; for a page in `folder` also link to the pages of the runs."""
     conditions, seeds = conditions_of(list(rows)), any(len(row.runs) > 1 for row in rows)
     costs = [*(["each seed [%]"] if seeds else []), "parameters [M]", "action [ms]", "steps", "training"]
     lines = []

@@ -89,7 +89,7 @@ def _most(values: Sequence[str]) -> dict[str, int]:
 
 
 def _panels(findings: StoreReport) -> Panels:
-    """Return panels of first images, outcomes, lengths, instructions, action labels and what was drawn differently."""
+    """Return panels of first images, outcomes, lengths, instructions, action labels, and the draws that vary."""
     entries, spec = findings.whole, findings.store.spec
     shown = [entries[place] for place in sorted({*np.linspace(0, len(entries) - 1, FRAMES).round().astype(int)})]
     first = [replace(episode_of(findings.store, entry).observations[0], depth={}) for entry in shown]

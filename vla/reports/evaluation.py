@@ -25,8 +25,8 @@ def write_report(
 ) -> None:
     """Write the report of the first condition as JSON atomically, with the evaluated policy and the resolved config.
 
-    `facts` are further entries, such as chosen options, parameters and latency. `conditions` have other reports on the
-    same seeds, `compared` their comparisons with the first.
+    `facts` are further entries, such as chosen options, parameters and latency. `conditions` are the reports of other
+    conditions on the same seeds, `compared` their comparisons with the first.
     """
     content = {
         **summary(report),

@@ -21,9 +21,9 @@ LENGTH_BINS = 30  # approximate number of bars in the histogram of lengths
 
 
 def factors(played: Sequence[Result]) -> dict[str, list[Any]]:
-    """Return name → value per episode, of every draw that all episodes have and that forms a few groups.
+    """Return name → value per episode, for every draw that all episodes have and that forms 2 to `GROUPS` groups.
 
-    A pair of numbers is a point, each item of another list is a factor. Of equal draws the first counts.
+    A pair of floats is a point; each item of any other list is a factor. Of draws with equal values the first counts.
     """
     rows = [dict(item for draw in flat(result.draws).items() for item in _items(*draw)) for result in played]
     columns = dict[str, list[Any]]()
@@ -51,7 +51,7 @@ def numeric(values: Sequence[Any]) -> bool:
 
 
 def groups(values: Sequence[Any]) -> list[list[int]]:
-    """Group the indices of the episodes: by value if there are few or words, else by quantiles; points by quadrants."""
+    """Group the indices of episodes: few values or words by value, other numbers by quantiles, points by quadrants."""
     if isinstance(values[0], tuple):
         values = [str(quarter) for quarter in np.array(values) > np.median(values, axis=0)]
     different = sorted(set(values), key=None if numeric(values) else str)

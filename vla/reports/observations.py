@@ -22,7 +22,7 @@ SHOWN = 6  # windows of the first training batch
 
 def reset_panels(seeds: Sequence[int], observations: Sequence[Observation]) -> Panels:
     """Return a panel per episode: the colour image of every camera, then its depth image, from near (blue) to far (red)
-    in one range for all episodes, and without returns black."""
+    in one range for all episodes; pixels without a return appear as near."""
     panels: Panels = {}
     for seed, seen in zip(seeds, observations, strict=True):
         images = [*seen.rgb.values()]

@@ -60,7 +60,7 @@ def errors_table(errors: Sequence[ComponentError], episodes: int) -> Table:
         high = "∞" if each.ci_high is None else f"{factor * each.ci_high:.3g}"
         rows.append([each.name, unit, error, f"{low}-{high}", still])
     heads = ("component", "unit", "error", "95 % CI", "of a constant action")
-    if not any(unit for _, unit, *_ in rows):  # a recording says none
+    if not any(unit for _, unit, *_ in rows):  # recordings have no units
         heads, rows = tuple(head for head in heads if head != "unit"), [[name, *rest] for name, _, *rest in rows]
     return Table(heads, rows, f"Mean absolute errors on {episodes} held-out episodes", NOTE)
 

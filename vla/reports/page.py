@@ -32,7 +32,7 @@ COMPARED = (
 
 @dataclass(frozen=True)
 class Section:
-    """Part of a page, left out if it has none of its contents."""
+    """Part of a page, left out if it is empty."""
 
     title: str
     note: str = ""
@@ -44,14 +44,14 @@ class Section:
 
     @property
     def rows(self) -> bool:
-        """Whether there is anything to show, as a table has rows."""
+        """Whether there is anything to show; named like the rows of a `Table`."""
         return bool(self.facts or self.panels or self.rollouts or (self.picture and self.picture.is_file()))
 
 
 def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bool = False, **content: Any) -> Path:
     """Write a page of the parts that are not empty, atomically, and return its path.
 
-    Of a run `content` has `subtitle`, `warning`, the large `rate` and what it is `of`.
+    For a run, `content` has `subtitle`, `warning`, the large `rate`, and `of`, a line that explains the rate.
     With `anytime` the results are valid whatever the reason to stop playing.
     """
     loader = FileSystemLoader(Path(__file__).parent)
@@ -75,7 +75,7 @@ def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bo
 
 
 def _embedded(picture: Path) -> str:
-    """Return a picture as a data URL; a UserError if it is none: a link could put any file into a page."""
+    """Return a picture as a data URL; raise a UserError for other files, which symbolic links could put into a page."""
     content = read_bounded(picture, LARGEST)
     if not content.startswith((b"RIFF", b"\x89PNG")):
         raise UserError(f"{picture} is no picture: remove it")

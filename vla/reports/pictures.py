@@ -23,12 +23,12 @@ from vla.io.files import atomic_path
 from vla.spec import Array
 
 Interval = tuple[float, float, float]  # success rate and its 95 % confidence interval
-Panels = dict[str, Callable[[Axes], object]]  # title → what draws the rest
+Panels = dict[str, Callable[[Axes], object]]  # title → function that draws the panel
 
 GREEN, RED, BLUE, GREY = "#2e9e5b", "#d2483f", "#3b76c4", "#8a8f98"
 COLOURS = (GREEN, BLUE, RED, "#d9942b", "#8a5bb8", "#2f9fa3", "#b5628f", GREY)  # of rows
 INK = "#010203"  # black, and on a page the colour of its text
-MIDDLE = "#7a7f86"  # readable on white and on black, of PNG files on a page
+MIDDLE = "#7a7f86"  # readable on white and on black, for PNG files on a page
 SIZE = (3.4, 2.3)  # of a panel [inch]
 
 
@@ -39,7 +39,7 @@ def error_bars(rates: Iterable[Interval]) -> tuple[Array, Array]:
 
 
 def rate_limits(lowest: float) -> tuple[float, float]:
-    """Return the limits of an axis of rates from about `lowest` on, where differences of high ones are visible."""
+    """Return the limits of an axis of rates, from about `lowest` to 1, which shows differences between high rates."""
     return max(0.0, math.floor(10 * lowest) / 10), 1.0
 
 
@@ -72,7 +72,7 @@ def plot_image(axes: Axes, image: Array) -> None:
 
 @contextmanager
 def _style(ink: str = INK) -> Iterator[None]:
-    """Style of everything that is drawn."""
+    """Apply the style of all plots within the context."""
     # Fonts of the machine for characters that matplotlib's own lacks, such as those of fonts-noto-cjk.
     families = ["DejaVu Sans", *sorted({font.name for font in fontManager.ttflist if "CJK" in font.name})]
     settings: Any = {
@@ -95,7 +95,7 @@ def save(
 ) -> None:
     """Draw panels, each of `size` [inch], in rows of `columns` into a PNG file, atomically.
 
-    It has texts and axes in the colour `ink`, other than black on a transparent background.
+    Text and axes have the colour `ink`; unless it is black, the background is transparent.
     """
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
@@ -111,7 +111,7 @@ def save(
 
 
 def svgs(panels: Panels) -> dict[str, Markup]:
-    """Return title → SVG without the title, in the colour of the page's text and with nothing from outside."""
+    """Return title → SVG without the title, in the colour of the page's text and without external references."""
     return {title: _svg(title, draw) for title, draw in panels.items()}
 
 

@@ -29,8 +29,8 @@ MOTION = (
 def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Mapping[str, Comparison]]) -> Table:
     """Tabulate success and its interval per condition, and its comparison with the first condition.
 
-    Rows below a condition are about each of its tasks, if it has several and the table stays short. Conditions that
-    share the report of the first one, because they are the training's own, are named below the table.
+    Below a condition there is a row for each of its tasks, if it has several and the table stays short. Conditions that
+    share the report of the first one, because they change nothing, are named below the table.
     """
     first, *others = reports
     equal = [name for name in others if reports[name] is reports[first]]
@@ -53,7 +53,7 @@ def _cells(found: Counted) -> list[str]:
 def secondary_table(
     compared: Mapping[tuple[str, ...], Mapping[str, Comparison]], heads: Sequence[str] = ("condition",)
 ) -> Table:
-    """Tabulate differences in milestones and motion, in a row for every case with any; `heads` name the words of it."""
+    """Tabulate differences in milestones and motion, in a row per case that has any; `heads` name its columns."""
     cases = {words: metrics for words, metrics in compared.items() if {*metrics} - {SUCCESS}}
     found = {name for metrics in cases.values() for name in metrics} - {SUCCESS}
     names = [*(name for name in AMOUNTS if name in found), *sorted(found - {*AMOUNTS})]

@@ -65,14 +65,14 @@ def write_page(folder: Path) -> Path:
 
 
 def _tasks(run: Run) -> str:
-    """Return the names of the evaluated tasks, or that of the task's class."""
+    """Return the names of the evaluated tasks, or how many there are; without any, the class of the goal or task."""
     classes = (str(at(run.config, key, "")).rpartition(".")[2] for key in ("task.goal._target_", "task._target_"))
     tasks = [in_words(task) for task in run.tasks] or [*filter(None, classes)][:1]
     return ", ".join(tasks) if len(tasks) <= NAMED else f"{len(tasks)} tasks"
 
 
 def _ended(run: Run) -> str:
-    """Return how a training ended that was not completed, in a sentence."""
+    """Return a sentence on how an incomplete training ended; "" if it was completed, or there was none."""
     if not run.training or run.training.ended == "done":
         return ""
     if run.training.ended != "interrupted":
@@ -81,7 +81,7 @@ def _ended(run: Run) -> str:
 
 
 def _near(path: Path, *folders: Path) -> Path:
-    """Return a path relative to the first folder that contains it, among them the working directory."""
+    """Return a path relative to the first of the folders, and last the working directory, that contains it."""
     for folder in (*folders, Path.cwd()):
         if path.resolve().is_relative_to(folder.resolve()):
             return path.resolve().relative_to(folder.resolve())
@@ -109,7 +109,7 @@ def _facts(run: Run) -> dict[str, str]:
 
 
 def _rollouts(run: Run) -> Section:
-    """Return the moving pictures, what the recording has, and how to play an episode again."""
+    """Return the moving pictures, what the recording contains, and how to record another episode."""
     results = [each for each in run.report.per_episode if each.outcome != ERROR] if run.report else []
     pictures, facts = pictured(results, run.folder / RECORDINGS), dict[str, str]()
     if (run.folder / RECORDING).is_file() and run.report:

@@ -1,4 +1,4 @@
-"""Tables of results: the same one for a terminal, as Markdown and on a page, and what its cells say."""
+"""Tables of results, for a terminal, as Markdown and on a page, and the formatting of their cells."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ Line = tuple[bool, str, Curve]  # whether it was logged in training, not in vali
 def training_sections(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> list[Section]:
     """Draw a panel per metric with the curves of all runs: colour and metrics of each.
 
-    Validated metrics come first, among them the loss; otherwise they keep the order of logging.
+    Metrics of validation come first, the loss before all others; otherwise the order of logging is kept.
     """
     parts: dict[str, dict[str, list[Line]]] = {"Training": {}, "Speed of the training": {}}
     for colour, metrics in runs:
@@ -55,7 +55,7 @@ def _plot(axes: Axes, title: str, lines: Sequence[Line]) -> None:
         axes.yaxis.set_minor_formatter("{x:g}")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter("{x:g}")  # without a common factor, for which there is no room
-    axes.set_xlim(left=0)  # a metric of one step would otherwise have an axis of its surroundings
+    axes.set_xlim(left=0)  # a metric with a single step would otherwise get an axis around it
     if title == "success":
         axes.set_ylim(0, 1)
     elif title.startswith("error"):

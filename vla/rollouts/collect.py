@@ -72,14 +72,14 @@ def collect(
 
     Existing episodes are kept. If another process is collecting into the same store, wait for it. Each process of
     `cluster` calls the two factories once. `multitask` tells the task of a seed; its tasks get equal shares. With
-    `keep_failures` every seed gives an episode: failures are stored and count too. There is a UserError if the store
+    `keep_failures` every seed gives an episode: failures are stored and count too. Raises a UserError if the store
     starts at another seed or is derived, the expert fails persistently, workers died, or the disk is full.
     """
     started, before = time.monotonic(), len(store.episodes)
     store.require_first_seed(seed)
     if before < episodes:
         store.require_growable()
-        with store.writing():  # once another process has finished, which may have added some
+        with store.writing():  # waits for another process, which may have added some
             before = len(store.episodes)
             store.require_first_seed(seed)
             if before < episodes:
@@ -154,7 +154,7 @@ def _needed(task: str, solved: Mapping[str, int]) -> bool:
 def _fill(
     store: EpisodeStore, episodes: int, seed: int, multitask: Multitask | None, keep_failures: bool, pool: Pool
 ) -> None:
-    """Append episodes until there are so many, or the expert fails too often in a row."""
+    """Append episodes until the store has `episodes`; raise a UserError if the expert fails too often in a row."""
     before, attempts, started = len(store.episodes), _Attempts(pool, multitask, store, seed), time.monotonic()
     outcomes = Counter(entry.success for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED))
     in_a_row = defaultdict[str, list[str]](list)  # task → outcomes of the failures since its last success
@@ -199,7 +199,7 @@ class DemonstrationWorker:
     def attempt(self, seed: int) -> Episode:
         """Roll out one seed, and verify a success by a replay, which must go through the same states, bit for bit.
 
-        Images that the expert does not look at are drawn in the replay; failures that are not kept never need them.
+        Images that the expert does not look at are rendered in the replay; failures that are not kept never need them.
         """
         episode = rollout(self._environment, self._expert, seed, all_images=self._keep_failures)
         if episode.success:

@@ -1,4 +1,4 @@
-"""Differences of success and of other amounts: exact tests, intervals, and the adjustment for several comparisons."""
+"""Differences in success and other metrics: exact tests, confidence intervals, adjustment for multiple comparisons."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SUCCESS = "success"  # what is compared first; the others are fields of `Motion`
 
 
 class Pairs(NamedTuple):
-    """Numbers of pairs of episodes, by what happened in them."""
+    """Numbers of pairs of episodes, by the episodes of the pair in which an event, such as success, happened."""
 
     both: int  # in both
     first: int  # in the first alone
@@ -36,7 +36,7 @@ class Pairs(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Second policy or condition minus the first: a rate, such as that of success, or the median of an amount."""
+    """Second policy or condition minus the first: difference in a rate, such as success, or median one in an amount."""
 
     difference: float  # a rate's is from -1 to 1
     ci_low: float  # of its 95 % confidence interval
@@ -49,10 +49,10 @@ class Comparison:
     verdict: str = ""
 
     def conclude(self, p_holm: float, margin: float | None) -> Comparison:
-        """Return a copy with an adjusted p-value and a verdict: a difference, none worse than `margin`, or neither.
+        """Return a copy with an adjusted p-value and a verdict: a difference, no loss beyond `margin`, or neither.
 
-        Not worse than a margin means that the lower end of the interval is above it (the test of non-inferiority at
-        2.5 %, not adjusted for the number of comparisons). Without a margin a difference is neither better nor worse.
+        "Not worse" means that the lower end of the interval is above -`margin` (the test of non-inferiority at 2.5 %,
+        not adjusted for multiple comparisons). Without a margin a difference is "more" or "less", not better or worse.
         """
         decided = p_holm <= LEVEL
         if margin is None:
@@ -114,7 +114,7 @@ def fisher(won_first: int, first: int, won_second: int, second: int) -> float:
 
 
 def newcombe(won_first: float, first: float, won_second: float, second: float) -> tuple[float, float]:
-    """Return the 95 % confidence interval of the second rate minus the first, of different episodes.
+    """Return the 95 % confidence interval of the second rate minus the first, for independent samples.
 
     R. G. Newcombe, "Interval estimation for the difference between independent proportions: comparison of eleven
     methods", Statistics in Medicine 17 (1998), 873-890, method 10: it combines Wilson's intervals of both rates.
@@ -125,7 +125,7 @@ def newcombe(won_first: float, first: float, won_second: float, second: float) -
 
 
 def newcombe_paired(pairs: Pairs) -> tuple[float, float]:
-    """Return the 95 % confidence interval of the second rate minus the first, of pairs; (-1, 1) without any.
+    """Return the 95 % confidence interval of the second rate minus the first, for pairs; (-1, 1) without any.
 
     R. G. Newcombe, "Improved confidence intervals for the difference between binomial proportions based on paired
     data", Statistics in Medicine 17 (1998), 2635-2650, method 10: it combines Wilson's intervals of both rates with the
@@ -150,7 +150,7 @@ def newcombe_paired(pairs: Pairs) -> tuple[float, float]:
 def pairs_of(
     together: Iterable[tuple[Result, Result]], happened: Callable[[Result], bool] = attrgetter("success")
 ) -> Pairs:
-    """Count what happened in pairs of episodes, without those of which one was not completed."""
+    """Count in which episodes of each pair an event happened, without pairs in which one was not completed."""
     counts = Counter((happened(one), happened(two)) for one, two in together if ERROR not in (one.outcome, two.outcome))
     return Pairs(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
 
@@ -158,7 +158,7 @@ def pairs_of(
 def compared_in(together: Together, anytime: bool) -> dict[str, Comparison]:
     """Compare pairs of episodes in success, in motion where both succeeded, and in milestones of the same task.
 
-    Returns `SUCCESS`, field of `Motion` or milestone → comparison, without fields of which too few pairs are known.
+    Returns `SUCCESS`, field of `Motion` or milestone → comparison, without fields that too few pairs have.
     """
     found = {SUCCESS: compare_pairs(pairs_of(together), anytime)}
     motions = [(one.motion, two.motion) for one, two in together if one.success and two.success]
@@ -176,8 +176,8 @@ def compared_in(together: Together, anytime: bool) -> dict[str, Comparison]:
 def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str, dict[str, Comparison]]:
     """Return condition → its comparisons with the first condition, which has none, with verdicts.
 
-    Pairs with an error do not count. Where episodes were played until it was clear, one report may be longer. The
-    `margin` of non-inferiority is a difference of rates, 0…1. A UserError tells that reports have different seeds.
+    Pairs with an error do not count. After early stopping, one report may be longer than the other. The `margin` of
+    non-inferiority is a difference of rates, 0…1. Raises a UserError if reports have different seeds.
     """
     (_, first), *others = reports.items()
     found = {}
@@ -191,10 +191,10 @@ def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str
 
 
 def concluded(cases: Mapping[Key, Mapping[str, Comparison]], margin: float | None) -> dict[Key, dict[str, Comparison]]:
-    """Return the comparisons of all cases with verdicts, adjusted for their number in two families: of success or not.
+    """Return the comparisons of all cases with verdicts, adjusted within two families: success, and all other metrics.
 
-    Each family has a false difference with a probability of at most 5 %: S. Holm, "A simple sequentially rejective
-    multiple test procedure", Scandinavian Journal of Statistics 6 (1979). Pairs that never differ cannot give a small
+    The family-wise error rate of each is at most 5 %: S. Holm, "A simple sequentially rejective multiple test
+    procedure", Scandinavian Journal of Statistics 6 (1979). Pairs that never differ cannot give a small
     p-value, so they do not count (R. E. Tarone, "A modified Bonferroni method for discrete data", Biometrics 46, 1990).
     """
     verdicts: dict[tuple[Key, str], Comparison] = {}

@@ -26,7 +26,7 @@ from vla.spec import FIRST_SEED, Agent, Agents, Environment, Episode, Recorder
 
 log = logging.getLogger(__name__)
 
-ROUNDS = 4  # episodes of a lane that a process plays at a time: lanes whose episodes are over wait for the others
+ROUNDS = 4  # episodes per lane in one work item, at the end of which lanes wait for each other
 
 RecorderFactory = Callable[[], Recorder]
 
@@ -47,7 +47,7 @@ def evaluate(
 ) -> Report:
     """Play the episodes of the seeds; `name` is the label of the progress bar.
 
-    Every process of the `cluster` calls the factories once; agents that are `vla.spec.Agents` act in so many `lanes`
+    Every process of the `cluster` calls the factories once; agents that are `vla.spec.Agents` act in `lanes` worlds
     side by side in each. `recordings` says which episodes are recorded: unless it is all of them, they are chosen at
     the end and played once more. Errors of a factory end the evaluation; an error or a crash of an episode is a result.
 
@@ -56,7 +56,7 @@ def evaluate(
     does not depend on the number of workers.
 
     Episodes whose seeds are in `known`, seed → result, are not played again. `keep` is called with every new result but
-    errors. There is a UserError if there are no seeds, seeds are in the range of collection, or the cluster raises one.
+    errors. Raises a UserError if there are no seeds, seeds are in the range of collection, or the cluster raises one.
     """
     if not seeds or min(seeds) < FIRST_SEED:
         raise UserError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
@@ -100,7 +100,7 @@ def _play_missing(
 
 @dataclass
 class _Score:
-    """Results so far, in any order; those count whose seeds come before the first that is missing."""
+    """Results so far, in any order; only those of seeds before the first missing one count."""
 
     seeds: Sequence[int]
     results: dict[int, Result]
@@ -138,7 +138,7 @@ class _Score:
 
 
 def _results(future: Future, seeds: Sequence[int]) -> list[Result]:
-    """Return the results of a group of episodes; if its process crashed none, or an error if it is a single one."""
+    """Return the results of a group of episodes; after a crash none, or an error result if the group is one episode."""
     try:
         return future.result()
     except Crashed as crash:
@@ -168,7 +168,7 @@ def play_episode(environment: Environment, agent: Agent, seed: int) -> Result:
 
 
 def result_of(seed: int, ended: Episode | Exception, control_hz: float) -> Result:
-    """Summarise what `play` makes of a seed, at so many steps per second [Hz]."""
+    """Summarise the episode, or the error, that `play` yields for a seed; `control_hz` is the steps per second."""
     try:
         if isinstance(ended, Exception):
             raise ended
@@ -187,7 +187,7 @@ def result_of(seed: int, ended: Episode | Exception, control_hz: float) -> Resul
             completed=completed and tuple(completed),
             motion=motion,
         )
-    except Exception as problem:  # of any kind: worlds are what people write
+    except Exception as problem:  # of any kind: worlds are user code
         where = traceback.extract_tb(problem.__traceback__)[-1]
         what = f"{type(problem).__name__}: {problem} ({Path(where.filename).name}:{where.lineno})"
         return Result(seed, ERROR, error=what)

@@ -17,14 +17,14 @@ from vla.spec import Agent, Array, Environment, Observation, Spec
 Modality = Literal["images", "instruction", "both"]
 
 GREY = 128
-STRIDE = 4  # of the pixels in which demonstrations are compared
+STRIDE = 4  # of the pixels that are compared
 
 
 class WithoutModality:
     """An agent whose images are grey and without depth, or whose instruction is empty, or both."""
 
     def __init__(self, agent: Agent, missing: Modality) -> None:
-        """Take a modality from an agent."""
+        """Hide a modality from an agent."""
         self._agent, self._missing = agent, missing
         self.info: dict[str, Any] = {}
 
@@ -58,14 +58,14 @@ class NearestDemonstration:
     """Replays the demonstration with the most similar first images, whatever happens; then repeats its last action.
 
     The demonstration has another seed and, if one exists, the same instruction. The distance of two first images is the
-    mean absolute difference over every `STRIDE`th row and column of all cameras, in the size of the demonstrations.
+    mean absolute difference over every `STRIDE`th row and column of all cameras, at the size of the demonstrations.
     This baseline for memorisation succeeds where remembering the demonstrations is enough.
     """
 
     def __init__(self, folder: Path, episodes: Count | None, *, spec: Spec) -> None:
         """Read the first images of the demonstrations in a store: of the first `episodes`, or of all.
 
-        There is a UserError if as of `open_memory`.
+        Raises as `open_memory`.
         """
         store = open_memory(folder, episodes, spec)
         self._entries, self._executed = store.episodes, store.rows("executed")
@@ -110,7 +110,7 @@ class NearestDemonstration:
 def open_memory(folder: Path, episodes: int | None, spec: Spec) -> EpisodeStore:
     """Open the store of the demonstrations to replay in a world with a spec.
 
-    There is a UserError if there is no such store, it has no or fewer episodes, or its spec does not fit.
+    Raises a UserError if there is no such store, it has no or too few episodes, or its spec does not fit.
     """
     store = EpisodeStore(folder, episodes)
     store.require_episodes()

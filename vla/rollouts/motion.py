@@ -32,12 +32,12 @@ def motion_of(episode: Episode, control_hz: float) -> Motion:
 
 
 def path_length(positions: Array) -> float:
-    """Return the length [m] of the polygon through positions (T, 3) [m]."""
+    """Return the length [m] of the polyline through positions (T, 3) [m]."""
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
 def log_dimensionless_jerk(positions: Array, hz: float) -> float | None:
-    """Return ln(D³ / v² ∫ |jerk|² dt), with duration D and largest speed v; None without four positions or a motion.
+    """Return ln(D³ / v² ∫ |jerk|² dt), with duration D and peak speed v; None below four positions, or without jerk.
 
     N. Hogan, D. Sternad, "Sensitivity of smoothness measures to movement duration, amplitude, and arrests", Journal of
     Motor Behavior 41 (2009). It depends neither on the size nor on the pace of a motion, and grows with every stop and

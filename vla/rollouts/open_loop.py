@@ -23,8 +23,8 @@ from vla.spec import Agent, Array, Episode, Spec
 class OpenLoop:
     """Recorded and predicted actions of several episodes, and mean absolute errors.
 
-    Every recording weighs alike in the means, and intervals are over recordings: neither the steps of an episode nor
-    the episodes that one recording was split into are independent.
+    Means give all recordings equal weight, and intervals are over recordings: neither the steps of an episode nor the
+    episodes that one recording was split into are independent.
     """
 
     spec: Spec

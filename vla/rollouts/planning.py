@@ -15,11 +15,11 @@ from vla.spec import Array
 
 MOST = 200_000  # episodes
 FAR = 9.0  # standard deviations beyond which outcomes are too rare to count
-HORIZON = 4  # length of an evaluation that stops when it is clear, as a multiple of the fixed number of episodes
+HORIZON = 4  # largest length of an evaluation with early stopping, as a multiple of the fixed number of episodes
 
 
 def episodes_needed(power: Callable[[int], float], enough: float) -> int | None:
-    """Return the number of episodes at which `power` comes to be `enough`; None if it is more than `MOST`.
+    """Return the number of episodes at which `power` reaches `enough`; None if it is more than `MOST`.
 
     As outcomes are discrete, power may fall below it again by a little for a few larger numbers.
     """
@@ -37,7 +37,7 @@ def power_for_bar(episodes: int, rate: float, bar: float) -> float:
 
     won = np.arange(episodes + 1)
     apart = (won / episodes - bar) * (1 if rate > bar else -1)
-    beside = apart > NORMAL_QUANTILE * sqrt(bar * (1 - bar) / episodes)  # solves Wilson's interval for its end
+    beside = apart > NORMAL_QUANTILE * sqrt(bar * (1 - bar) / episodes)  # then Wilson's interval excludes the bar
     return float(binom.pmf(won, episodes, rate)[beside].sum())
 
 
@@ -77,7 +77,7 @@ def power_of_samples(episodes: int, one: float, other: float) -> float:
 
 @dataclass(frozen=True)
 class Stopping:
-    """Numbers of episodes of evaluations that stop when it is clear."""
+    """Numbers of episodes of evaluations that stop as soon as they are decided."""
 
     most: int  # number of episodes after which the share `enough` of the evaluations is decided
     mean: float  # mean number of episodes if evaluations end after `most`
@@ -87,10 +87,10 @@ class Stopping:
 def stopping(mean: float, one: float, zero: float, enough: float, fixed: int) -> Stopping | None:
     """Return how long evaluations take that stop as soon as their observations, 0 or 1, exclude a `mean`.
 
-    For one policy every episode is an observation, and `mean` is the bar; for two, a pair of episodes is one if just
-    one policy succeeds, and `mean` is 1/2. An episode gives a 1 and a 0 with the probabilities `one` and `zero`. The
-    share `enough` of the evaluations is to be decided, for which `fixed` episodes are needed without stopping. Returns
-    None if fewer are decided after `HORIZON` times as many.
+    For one policy every episode is an observation, and `mean` is the bar; for two, every pair of episodes in which
+    exactly one policy succeeds, and `mean` is 1/2. An episode gives a 1 and a 0 with the probabilities `one` and
+    `zero`. The share `enough` of the evaluations is to be decided, which takes `fixed` episodes without early stopping.
+    Returns None if a smaller share is decided after `HORIZON` times as many.
     """
     from scipy.stats import binom
 

@@ -1,6 +1,6 @@
 """Asynchronous execution of chunks: one is executed while the next is computed; actions that arrive late are skipped.
 
-Which action is due is said by `vla.schedule.Schedule`, in executed actions.
+`vla.schedule.Schedule` determines which action is due; its time is the number of executed actions.
 
 Shapes: k action chunk, D action components.
 """
@@ -31,8 +31,8 @@ class Network:
     Attributes:
         latency: shortest time from an observation to its actions, inference included [s].
         jitter: largest addition to it, uniformly distributed [s].
-        loss: probability that an observation or its answer is lost; another one is sent when the longest time is over.
-        ensemble: m of the mean over all chunks for a step, see `averaged`; None: only the newest one counts.
+        loss: probability that an observation or its answer is lost; the next one is sent after the longest time.
+        ensemble: m in the weights of the mean over all chunks for a step, see `averaged`; None: only the newest counts.
     """
 
     latency: NonNegative
@@ -61,10 +61,10 @@ class RealTime:
     def __init__(
         self, spec: Spec, link: SimulatedLink | BackgroundLink, execute: Callable[[], int], ensemble: float | None
     ) -> None:
-        """Act by a link to a policy.
+        """Act through a link to a policy.
 
-        `execute` returns the number of actions after which the next observation is sent, once an answer is there. With
-        an `ensemble`, see `Network`, every observation is sent.
+        `execute` returns the number of executed actions of a chunk after which the next observation is sent; with an
+        `ensemble`, see `Network`, that is 1. Nothing is sent while an answer is pending.
         """
         self._link, self._execute, self._ensemble = link, execute, ensemble
         columns = zip(spec.action, spec.units, spec.low, spec.high, strict=True)
@@ -97,7 +97,7 @@ class RealTime:
         return np.where(self._relative, 0, self._last).astype(np.float32)
 
     def _running(self, observation: Observation) -> Observation:
-        """Return the observation with the rest of the plan that is executed until the next one is there."""
+        """Return the observation with the rest of the plan that is executed until the next one arrives."""
         rest = self._schedule.remaining(self._step)
         if not rest or self._ensemble is not None:
             return observation
@@ -139,10 +139,10 @@ class SimulatedLink:
         self.now += 1
 
     def send(self, observation: Observation, first: bool) -> Delayed:
-        """Compute the chunk, and draw when it arrives; the `first` one is waited for until it is not lost."""
+        """Compute the chunk, and draw when it arrives; the `first` one is never lost."""
         seconds, lost = self._network.draw(self._random)
         steps = math.ceil(seconds * self._hz - 1e-9)
-        actions = self._plan(observation)  # also where it is lost: on its way back
+        actions = self._plan(observation)  # even if it is lost, which happens on the way back
         return Delayed(self, self.now + (max(steps, 1) if lost else steps), None if lost and not first else actions)
 
 
@@ -216,7 +216,7 @@ class OverNetwork:
         self._agent.reset(instruction, seed)
 
     def _execute(self) -> int:
-        """Return how many actions to execute before the next observation; a history wants to see every one."""
+        """Return how many actions to execute before the next observation is sent; a history needs every observation."""
         return 1 if getattr(self._agent, "history", 1) > 1 else getattr(self._agent, "execute", None) or 1
 
     def act(self, observation: Observation) -> Array:

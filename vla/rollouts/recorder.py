@@ -40,7 +40,7 @@ class RerunRecorder:
     def __init__(self, folder: str | os.PathLike[str], pictures: Natural) -> None:
         """Create the folder of the recordings, in which files are named by `recording_name`.
 
-        Of the first episodes of each outcome, so many as `pictures`, there is also a moving picture.
+        The first `pictures` episodes of each outcome also get a moving picture.
         """
         self._folder, self._pictures = Path(folder), pictures
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -62,7 +62,7 @@ class RerunRecorder:
         self._pose()
 
     def end(self, episode: Episode) -> None:
-        """Write the files of the episode atomically; an OSError if they cannot be written."""
+        """Write the files of the episode atomically; raise an OSError if they cannot be written."""
         self._pose()
         name, spec = recording_name(episode.seed, episode.outcome), self._spec
         # Random part: the viewer merges recordings of the same id, and policies share seeds.
@@ -84,7 +84,7 @@ class RerunRecorder:
         recording = content.read() or b""
         stream.disconnect()
         del writer, stream
-        rerun_bindings.flush_and_cleanup_orphaned_recordings()  # else its threads and its memory stay
+        rerun_bindings.flush_and_cleanup_orphaned_recordings()  # else its threads and memory leak
         with atomic_path(self._folder / f"{name}.rrd") as draft:
             draft.write_bytes(recording)
         self._pictured[episode.outcome] += 1
@@ -118,7 +118,7 @@ class _Writer:
         self._static("draws", rr.TextDocument(draws, media_type="text/markdown"))
 
     def events(self, events: Sequence[tuple[int, str]]) -> None:
-        """Write what happened without the agent, at the last step before it or the first one that shows it."""
+        """Write events that the agent did not cause, at the last step before them or the first one that shows them."""
         if events:
             steps, texts = zip(*events, strict=True)
             self._columns(EVENTS, np.array(steps), rr.TextLog.columns(text=texts))
@@ -169,9 +169,9 @@ class _Writer:
         self._static("tokens/names", rr.Points2D(beside, labels=self._spec.action, radii=0.0, show_labels=True))
 
     def _shades(self, path: str, steps: Array, pixels: Array, colours: Any, ends: Any, **fields: float) -> None:
-        """Write images (N, H, W) of whole numbers, with the numbers that have the first and the last of the colours.
+        """Write integer images (N, H, W) in a colour map that ranges over the two values `ends`.
 
-        To Rerun they are depths: only those have colours of their own.
+        They are logged as depth images, the only kind for which Rerun has colour maps.
         """
         height, width = pixels.shape[1:]
         kind = {1: "U8", 2: "U16"}[pixels.itemsize]
@@ -209,7 +209,7 @@ def _by_unit(units: Sequence[str]) -> dict[str, list[int]]:
 
 
 def _said(drawn: Any) -> str:
-    """Return what was drawn as text for a person: plain data, numbers with three digits."""
+    """Format a draw, which is plain data, for people: floats with three digits."""
     if isinstance(drawn, Mapping):
         return ", ".join(f"{name} {_said(value)}" for name, value in drawn.items())
     if isinstance(drawn, (list, tuple)):
@@ -297,7 +297,7 @@ def _curves(what: str, units: Sequence[str]) -> list[rrb.TimeSeriesView]:
 def merge(files: Sequence[Path], target: Path) -> None:
     """Merge recordings into one file, in which the viewer lists them by name.
 
-    There is a UserError if there are no files, or one of them is no recording.
+    Raises a UserError if there are no files, or one of them is no recording.
     """
     if not files:
         raise UserError(f"no recordings to merge into {target}")

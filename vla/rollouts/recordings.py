@@ -1,4 +1,4 @@
-"""Which episodes of an evaluation are recorded, and what stays of their recordings in the folder of the run."""
+"""Choice of the episodes of an evaluation to record, and of the recordings that stay in the folder of the run."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from vla.rollouts.results import ERROR, Report, Result, recording_name
 
 log = logging.getLogger(__name__)
 
-# "all" episodes, the "failures" and a few successes, or so many episodes, failures first.
+# "all" episodes, the "failures" and a few successes, or a number of episodes, failures first.
 Recordings = Literal["all", "failures"] | int
 
 SUCCESSES = 10  # successes beside the failures
 FAILURES_SHOWN, SUCCESSES_SHOWN = 6, 3  # moving pictures
-LARGEST, MOST = 1 << 29, 2000  # [bytes] and recordings in one file: to merge takes seven times as much memory
+LARGEST, MOST = 1 << 29, 2000  # limits of a file, [bytes] and recordings: merging takes seven times its size in memory
 SUFFIXES = (".rrd", ".webp")  # of a recording and of a moving picture
 
 
@@ -51,7 +51,7 @@ def pictured(results: Iterable[Result], folder: Path) -> dict[int, Path]:
 
 
 def clear(folder: Path, kept: Container[Path] = ()) -> None:
-    """Remove the recordings and moving pictures in a folder but for those that are `kept`."""
+    """Remove the recordings and moving pictures in a folder except those that are `kept`."""
     for file in folder.glob("*"):
         if file.suffix in SUFFIXES and file not in kept:
             file.unlink()
@@ -77,8 +77,8 @@ def merge_recordings(report: Report, folder: Path, target: Path, wanted: Recordi
 
 
 def keep_pictures(report: Report, folder: Path, wanted: Recordings, merged: Container[int]) -> None:
-    """Remove the recordings of the seeds that were merged, all moving pictures but those of the episodes to be `shown`,
-    and a folder without anything."""
+    """Keep the recordings of `wanted` episodes that were not `merged`, and the moving pictures to be `shown`; remove
+    all others, and the folder if it is then empty."""
     wanted_ones = chosen(report, wanted)
     pictures = pictured(wanted_ones, folder)
     kept = {pictures[each.seed] for each in shown(each for each in wanted_ones if each.seed in pictures)}

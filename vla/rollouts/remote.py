@@ -112,7 +112,7 @@ class RemotePolicy:
         self._real_time = RealTime(self.spec, link, lambda: self.execute or 1, self.ensemble)
 
     def _adopt_metadata(self) -> None:
-        """Compare what the server says of its policy, as `vla.deploy.server` does, with the spec.
+        """Compare the server's metadata, such as `vla.deploy.server` sends, with the spec; adopt how to use its chunks.
 
         Raises:
             UserError: its actions have other names, and no mapping is given.
@@ -130,12 +130,12 @@ class RemotePolicy:
             for name in ("execute", "history")
         )
         self.history = history or 1  # frames of a window; above 1 every observation is sent
-        # Plans come back as they were sent, which a mapping of actions cannot do.
+        # A running plan is returned to the server in its own actions, which a mapping cannot restore.
         self.chunking = self.metadata.get("chunking") is True and self.actions is None
         self.execute = self._wanted = self._configured_execute or (1 if self.history > 1 else advertised)
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Start an episode: drop all chunks, connect again if that broke, and tell a server that has episodes."""
+        """Start an episode: drop all chunks, reconnect after an error, and notify a server that supports resets."""
         self._real_time.reset(seed)
         if self._broken:
             self._connection.connect()
@@ -153,7 +153,7 @@ class RemotePolicy:
         return self._real_time.act(observation)
 
     def plan(self, observation: Observation) -> Array:
-        """Return the server's chunk, (k, D) float32, clipped, of which `execute` are meant to act. Raises as `act`."""
+        """Return the server's chunk, (k, D) float32, clipped; its first `execute` are executed. Raises as `act`."""
         began = time.perf_counter()
         answer = self._ask(self.message(observation))
         self.info = {"answer_ms": 1000 * (time.perf_counter() - began)}
@@ -213,7 +213,7 @@ class RemotePolicy:
 class Connection:
     """A WebSocket to a policy server, in a thread with an event loop of its own.
 
-    Python's TLS socket would lose messages if two threads read and wrote at a time, and pings are answered meanwhile.
+    The loop answers pings between messages, and Python's TLS sockets lose data if two threads read and write at once.
     """
 
     def __init__(self, url: str, timeout: float, api_key: str | None) -> None:
@@ -231,7 +231,7 @@ class Connection:
             raise
 
     def connect(self) -> None:
-        """Connect again; `metadata` is what the server then says of its policy."""
+        """Connect, or reconnect; `metadata` is then what the server tells about its policy."""
         try:
             self.metadata = self._wait(self._connect())
         except InvalidStatus as error:
@@ -250,7 +250,7 @@ class Connection:
                 self.url,
                 host=place.host,  # where host and port are given, redirections elsewhere are refused
                 port=place.port,
-                proxy=None,  # of the environment
+                proxy=None,  # ignore proxies of the environment
                 compression=None,
                 max_size=2**26,
                 additional_headers=self._headers,
@@ -265,7 +265,7 @@ class Connection:
         return await asyncio.wait_for(self._received(self._socket), self.timeout)
 
     def ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the answer to a message; a UserError if there is none."""
+        """Return the answer to a message; raise a UserError if there is none."""
         assert self._socket is not None
         try:
             return self._wait(asyncio.wait_for(self._asked(self._socket, pack(message)), self.timeout))
@@ -273,7 +273,7 @@ class Connection:
             reason = f" ({error.rcvd.reason})" if error.rcvd and error.rcvd.reason else ""
             raise self.error(f"it closed the connection{reason}") from error
         except TimeoutError as error:
-            self._loop.call_soon_threadsafe(self._socket.transport.abort)  # a late answer would be the next one's
+            self._loop.call_soon_threadsafe(self._socket.transport.abort)  # a late answer would be taken for the next
             raise self.error(f"no answer within {self.timeout:g} s") from error
 
     async def _asked(self, socket: ClientConnection, message: bytes) -> dict[str, Any]:
@@ -297,7 +297,7 @@ class Connection:
             await self._socket.close()
 
     def error(self, what: str) -> UserError:
-        """Return the error that names the server."""
+        """Return an error that names the server."""
         return UserError(f"the policy server at {self.url} failed: {what}")
 
     def close(self) -> None:

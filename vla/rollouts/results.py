@@ -32,7 +32,7 @@ class Result:
     milestones: tuple[str, ...] = ()  # in alphabetical order
     error: str = ""  # message, if the outcome is "error"
     completed: tuple[int, int] | None = None  # instructions completed, of how many; None if there is only one
-    motion: Motion | None = None  # None if the outcome is "error", or in reports of before it was measured
+    motion: Motion | None = None  # None if the outcome is "error", or in reports from before it was measured
 
     @property
     def success(self) -> bool:
@@ -60,7 +60,7 @@ class Median:
 
 
 class Counted(NamedTuple):
-    """Episodes that had an event, such as success, of all that were completed."""
+    """Number of completed episodes with an event, such as success, and its confidence interval."""
 
     count: int
     of: int
@@ -128,7 +128,7 @@ class Report:
 
     @property
     def medians(self) -> dict[str, Median]:
-        """Field of `Motion` → its median in successful episodes, without fields that nobody measured."""
+        """Field of `Motion` → its median in successful episodes, without fields that were never measured."""
         motions, found = [result.motion for result in self.results if result.success], dict[str, Median]()
         for name in AMOUNTS:
             measured = [getattr(motion, name, None) for motion in motions]
@@ -154,7 +154,7 @@ class Report:
         if not chains:
             return None
         done, length = [done for done, _ in chains], max(length for _, length in chains)
-        if self.anytime:  # bets on shares of a success lose more than bets on the values would
+        if self.anytime:  # conservative: bets on shares of successes gain less than bets on the values
             share = sum(done) / length
             low, high = (length * bound for bound in anytime_interval(share, len(done) - share))
         else:
@@ -181,8 +181,8 @@ class Report:
 
     @property
     def rates(self) -> dict[str, dict[str, Counted]]:
-        """What there is beside the rate of success, name → rate: of milestones, of instructions completed in a row, and
-        success by task and by tier; by task where there are several, or tiers of them."""
+        """Kind → name → rate, besides overall success: milestones, instructions completed in a row, success by task (if
+        there are several, or tiers), and success by tier."""
         tasks = self.tasks if len(self.tasks) > 1 or self.tiers else {}
         return {
             "milestones": {name: self.counted(count) for name, count in self.milestones.items()},
@@ -192,7 +192,7 @@ class Report:
         }
 
     def _matching(self, patterns: Sequence[str]) -> list[str]:
-        """Return the tasks with names such as `patterns`, in which * stands for any text."""
+        """Return the tasks whose names match one of the `patterns`, in which * stands for any text."""
         names = {result.task for result in self.results}
         return [task for task in names if any(fnmatchcase(task, pattern) for pattern in patterns)]
 
@@ -211,7 +211,7 @@ class Report:
 
     @staticmethod
     def _stratified(groups: Sequence[Mapping[str, Report]]) -> Rate:
-        """Return the mean rate over groups of tasks, in each of which episodes weigh alike."""
+        """Return the mean rate over groups of tasks, within which all episodes have equal weight."""
         played = [[task for task in group.values() if task.episodes] for group in groups]
         totals = [len(groups) * sum(task.episodes for task in tasks) for tasks in played]
         return stratified_interval(

@@ -1,4 +1,4 @@
-"""Single episodes: of an agent in an environment, and their replay."""
+"""Rollout of a single episode by an agent in an environment, and its replay."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def rollout(
 ) -> Episode:
     """Run the episode of `seed` to its end: `vla.rollouts.worlds.play` in one world.
 
-    There is a UserError if an action has the wrong shape or is not finite, or the episode is over at its start.
+    Raises a UserError if an action has the wrong shape or is not finite, or the episode is over at its start.
     """
     stage = Stage(environment, recorder)
     ((_, ended),) = play([stage], in_lanes(agent), [seed], recorder is not None, all_images)

@@ -31,7 +31,7 @@ ON_SUCCESS = np.cos((2 * np.arange(BETS) + 1) * np.pi / (4 * BETS)) ** 2
 
 
 def log_capital(mean: float, ones: Array | float, zeros: Array | float, halves: Array | int = 0) -> Array:
-    """Return the logarithm of the capital after bets against observations of this mean, which is between 0 and 1.
+    """Return the logarithm of the capital after bets against the hypothesis of this `mean`, which is between 0 and 1.
 
     The numbers of observations of 1, of 0 and of 1/2 may be arrays of one shape.
     """
@@ -43,7 +43,7 @@ def log_capital(mean: float, ones: Array | float, zeros: Array | float, halves: 
 
 
 def excludes(mean: float, ones: int, zeros: int, halves: int = 0, comparisons: int = 1) -> bool:
-    """Return whether observations have shown that their mean is another one, which is between 0 and 1.
+    """Return whether observations exclude the hypothesis of this `mean`, which is between 0 and 1.
 
     The number of `comparisons` is for the Bonferroni correction.
     """
@@ -73,8 +73,8 @@ def anytime_interval(ones: float, zeros: float, halves: int = 0) -> tuple[float,
     return 0.0 if ones + halves == 0 else bound(0.0), 1.0 if zeros + halves == 0 else bound(1.0)
 
 
-# Of pairs of episodes: those in which only the first succeeded, those in which only the second did, and all of them. A
-# pair is an observation of 1 if the second one did better, of 0 if the first did, else of 1/2.
+# `first`, `second` and `pairs` are the numbers of pairs of episodes in which only the first succeeded, only the second,
+# and of all. A pair is an observation of 1 if the second one did better, of 0 if the first did, else of 1/2.
 
 
 def anytime_difference(first: int, second: int, pairs: int) -> tuple[float, float]:
@@ -86,7 +86,7 @@ def anytime_difference(first: int, second: int, pairs: int) -> tuple[float, floa
 def anytime_p(first: int, second: int) -> float:
     """Return a p-value for equal success, valid at any time: one over the capital from bets on a fair coin.
 
-    Of a pair that differs, it is as likely to favour either; the others do not change the capital.
+    Under the null hypothesis a discordant pair favours either one equally; other pairs do not change the capital.
     """
     return float(np.exp(-max(log_capital(0.5, second, first), 0.0)))
 

@@ -30,11 +30,11 @@ MOST = 1024  # workers
 
 
 class Request(NamedTuple):
-    """What a worker wants of the policy."""
+    """A request of a worker to the policy."""
 
     kind: str  # "act", "plan" or "reset"
     lane: int
-    content: Any  # the observation; of "reset" instruction and seed
+    content: Any  # the observation; for "reset", instruction and seed
     answer: Future[Any]
 
 
@@ -51,7 +51,7 @@ class _Planner(Agents, Protocol):
 
 @contextmanager
 def shared_policy(make_policy: Callable[[], _Planner]) -> Iterator[Callable[[Environment], _DistantPolicy]]:
-    """Run a policy for all workers on this machine within the context, which is entered with the factory of agents."""
+    """Run a policy for all workers on this machine within the context; yield the factory of their agents."""
     with one_thread_each(), Listener(family="AF_UNIX", authkey=(key := secrets.token_bytes(32))) as listener:
         policy, requests = make_policy(), queue.Queue[Request | None]()
         with (
@@ -71,10 +71,10 @@ def shared_policy(make_policy: Callable[[], _Planner]) -> Iterator[Callable[[Env
 
 
 def _accept(listener: Listener, begin: Callable[[int, Connection, Spec], Future[None]]) -> None:
-    """Begin a talk with every worker that connects, each in a lane of its own, until it has left."""
+    """Begin a talk with every worker that connects; it has a lane of its own until it leaves."""
     lanes = set[int]()
     while True:
-        with suppress(AuthenticationError, EOFError, OSError):  # whoever else finds the socket
+        with suppress(AuthenticationError, EOFError, OSError):  # of other programs that find the socket
             connection = listener.accept()
             if (spec := connection.recv()) is None:
                 return
@@ -83,7 +83,7 @@ def _accept(listener: Listener, begin: Callable[[int, Connection, Spec], Future[
 
 
 def _serve(policy: _Planner, requests: queue.Queue[Request | None]) -> None:
-    """Answer requests, those that wait together in one call of the policy, until there is None."""
+    """Answer requests until None arrives; those that wait at the same time share a call of the policy."""
     while (first := requests.get()) is not None:
         waiting = [first]
         with suppress(queue.Empty):
@@ -100,7 +100,7 @@ def _reset(policy: _Planner, episodes: Sequence[tuple[str, int]], lanes: Sequenc
 
 
 def _answer(call: Callable[..., Iterable[Any]], requests: Sequence[Request]) -> None:
-    """Answer requests together; where an observation is refused, one by one."""
+    """Answer requests together, or one by one if an observation is refused."""
     try:
         answers = call([request.content for request in requests], [request.lane for request in requests])
     except Exception as error:  # of any kind: the worker raises it
@@ -137,7 +137,7 @@ def _talk(
 def _observation(
     memory: SharedMemory, spec: Spec, instruction: str, has_images: bool, running: Running | None
 ) -> Observation:
-    """Return a copy of what a worker has written to its memory, with the rest of its observation."""
+    """Return the observation of a worker: a copy of the arrays in its shared memory, and the parts that it sent."""
     images = {name: view.copy() for name, view in _views(memory, spec).items()}
     state = images.pop("")
     return Observation(images if has_images else {}, state, instruction, running=running)
@@ -162,7 +162,7 @@ class _DistantPolicy:
     """The agent of one world whose policy is in another process of this machine."""
 
     def __init__(self, address: str, key: bytes, environment: Environment) -> None:
-        """Connect to a policy; a UserError if it has another spec than the environment."""
+        """Connect to a policy; raise a UserError if it has another spec than the environment."""
         self._connection, self._world = Client(address, authkey=key), environment.spec.without_truth
         self._connection.send(self._world)
         name, self.spec, self.execute, self.history = self._connection.recv()
@@ -188,7 +188,7 @@ class _DistantPolicy:
         return self._show("plan", observation)
 
     def _show(self, kind: str, observation: Observation) -> Array:
-        """Write an observation to the shared memory, and ask for what answers it."""
+        """Write an observation to the shared memory, and return the answer of the policy."""
         arrays: Mapping[str, Array] = {**observation.rgb, "": np.asarray(observation.state, np.float32)}
         for name, view in _views(self._memory, self._world).items():
             array = arrays.get(name, view)
@@ -208,6 +208,6 @@ class _DistantPolicy:
         return result
 
     def close(self) -> None:
-        """Leave the policy."""
+        """Disconnect from the policy."""
         self._memory.close()
         self._connection.close()

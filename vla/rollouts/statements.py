@@ -32,12 +32,12 @@ class AgainstBar:
 
 @dataclass(frozen=True)
 class AgainstRun:
-    """Difference from the success of another run on the same episodes, or a bound on it, `margin`."""
+    """Comparison with another run on the same episodes: a difference in success, or equivalence within `margin`."""
 
     run: str
     results: Mapping[int, Result]  # seed → result of the other run
     margin: float
-    anytime: bool = False  # whether the other run stopped when something was clear
+    anytime: bool = False  # whether the other run stopped early
 
     def require_common(self, seeds: Iterable[int]) -> None:
         """Raise a UserError if the other run completed no episode with one of these seeds."""
@@ -50,7 +50,7 @@ class AgainstRun:
     def is_decided(self, report: Report) -> bool:
         """Return whether the episodes of a report decide the statement, or the other run has no later ones.
 
-        It is valid after any number of episodes. A UserError tells that equal seeds are other episodes.
+        It is valid after any number of episodes. Raises a UserError if equal seeds are different episodes.
         """
         seen, pairs = self._paired(report, alike=False), pairs_of(self._paired(report))
         if sum(pairs_of(seen)) and not sum(pairs):
@@ -71,9 +71,9 @@ class AgainstRun:
         )
 
     def _paired(self, report: Report, alike: bool = True) -> Together:
-        """Return results of the other run and of this one with the same seeds.
+        """Return pairs of results, of the other run and of this one, with the same seed.
 
-        `alike`: of the same episodes only, because another goal or level of randomisation gives a seed another one.
+        `alike`: of the same episode only; under another goal or level of randomisation a seed gives another episode.
         """
         pairs = [(self.results[mine.seed], mine) for mine in report.results if mine.seed in self.results]
         same = [(one.instruction, one.draws) == (two.instruction, two.draws) for one, two in pairs]

@@ -33,7 +33,7 @@ def wilson_interval(successes: float, trials: float) -> tuple[float, float]:
 def stratified_interval(strata: Sequence[tuple[int, int, float]]) -> tuple[float, float, float]:
     """Return the weighted mean of proportions and its 95 % confidence interval; (0, 0, 1) without trials.
 
-    Only chance within a stratum counts: strata, such as the tasks of a benchmark, are fixed. Wilson's interval at
+    Only chance within a stratum counts: strata, such as the tasks of a benchmark, are fixed. It is Wilson's interval at
     the effective sample size, at which the binomial variance equals the estimated one. In estimating the variance,
     half a success and half a failure are added to every stratum, else one without failures would seem certain; the
     estimate is scaled to be unbiased at a rate of one half, else few trials per stratum would give too small ones.
@@ -118,7 +118,7 @@ def pooled_interval(trainings: Sequence[Mapping[int, bool]]) -> tuple[float, flo
 
 
 def effective_episodes(trainings: Sequence[Mapping[int, bool]]) -> tuple[float, float]:
-    """Return how many successes of how many independent episodes tell as much as the episodes of several trainings.
+    """Return the numbers of successes and of independent episodes that the episodes of several trainings are worth.
 
     Episodes are correlated within a training and within a scene, so the effective sample size is smaller than their
     number. It is the one whose binomial variance equals the variance of the mean, estimated with trainings, with

@@ -1,4 +1,4 @@
-"""Worlds side by side, and the loop in which agents act in them: the only one there is.
+"""Worlds side by side, and the agent-environment loop, of which there is only this one.
 
 Every world is a lane, and so is the agent in it. An episode is a function of its seed alone: it depends neither on the
 number of lanes nor on what is played in the others.
@@ -20,19 +20,19 @@ from vla.spec import Agent, Agents, Array, Environment, Episode, Observation, Re
 
 
 class Stage:
-    """One world, and what was seen and done so far in the episode that is played in it."""
+    """One world, with the observations and actions of its current episode so far."""
 
     def __init__(self, environment: Environment, recorder: Recorder | None = None) -> None:
         self.environment, self._recorder = environment, recorder
         self._recording: Recorder | None = None
 
     def reset(self, seed: int, recorded: bool = False) -> Observation:
-        """Start the episode of a seed; a UserError if it is over at its start."""
+        """Start the episode of a seed; raise a UserError if it is over at its start."""
         self._now = self.environment.reset(seed)
         if self.environment.done:
             raise UserError(f"the episode of seed {seed} is over at its start: `reset` must draw another one")
         self._seed, self._seen, self._clean, self._executed = seed, list[Observation](), list[Array](), list[Array]()
-        # Asked now, because the tool of a world may exist from its first episode on.
+        # Read after the reset: the tool of a world may exist only from its first episode on.
         self._tool = [getattr(self.environment, "tool", None)]
         self._recording = self._recorder if recorded else None
         if self._recording is not None:
@@ -78,7 +78,7 @@ class Stage:
 
 
 class _Alone:
-    """An agent of one world in a single lane."""
+    """Adapter of an agent of one world to `Agents`, with a single lane."""
 
     def __init__(self, agent: Agent) -> None:
         if not hasattr(agent, "info"):
@@ -104,7 +104,7 @@ class _Alone:
 
 
 def in_lanes(agent: Agent | Agents) -> Agents:
-    """Return agents in lanes; an agent of one world is in a single one."""
+    """Return an agent as `Agents`; an agent of one world gets a single lane."""
     return agent if isinstance(agent, Agents) else _Alone(agent)
 
 
@@ -113,7 +113,7 @@ class _Episode:
     """An episode that is played in a lane."""
 
     seed: int
-    instruction: str | None = None  # None: nothing was seen yet
+    instruction: str | None = None  # None: before the first observation
     all_images: bool = False  # whether all images are rendered
     blind: bool = False  # whether the newest observation has no images
 
@@ -121,7 +121,7 @@ class _Episode:
 def play(
     stages: Sequence[Stage], agents: Agents, seeds: Sequence[int], recorded: bool = False, all_images: bool = True
 ) -> Iterator[tuple[int, Any]]:
-    """Play the episodes of seeds side by side, on a stage per lane; yield seed → `Episode`, or its error, as they end.
+    """Play the episodes of seeds side by side, on a stage per lane; yield (seed, `Episode` or error) as each ends.
 
     A new instruction resets the agent. Without `all_images`, images are rendered only at steps where the agent reads
     them; if a new instruction makes it read one that was not rendered, the episode is run again with all images.
@@ -129,8 +129,8 @@ def play(
     An error of a world, or in the reset of an agent, ends its episode. An error in `act` ends all that were to act
     together; but after a ValueError, with which no lane has acted, each acts alone, and only those that fail again end.
 
-    As long as there are some, a lane plays seeds that are its number modulo the number of lanes: a policy, in which the
-    seed of an episode determines its row, then serves all lanes in one pass.
+    As long as there are any, a lane plays the seeds that equal its number modulo the number of lanes. The seed of an
+    episode determines its row in the batch of a policy, so one pass then serves all lanes.
     """
     waiting, playing = list(seeds), dict[int, _Episode]()
     answers: dict[int, Any] = {}  # of the worlds: the next observation, the ended episode, or an error
@@ -153,7 +153,7 @@ def play(
                 else:  # an image is missing: play it again
                     playing[lane] = _Episode(playing[lane].seed, all_images=True)
                     answers[lane] = _tried(stages[lane].reset, playing[lane].seed, recorded)
-            except Exception as error:  # of any kind: agents are what people write
+            except Exception as error:  # of any kind: agents are user code
                 ended[lane] = error
         for lane, action in _acted(agents, observations, len(stages[0].environment.spec.action)).items():
             if isinstance(action, Exception):
@@ -168,7 +168,7 @@ def play(
 def _tried(call: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return call(*arguments)
-    except Exception as error:  # of any kind: worlds are what people write
+    except Exception as error:  # of any kind: worlds are user code
         return error
 
 
@@ -182,7 +182,7 @@ def _follows(agents: Agents, lane: int, playing: _Episode, seen: Observation) ->
 
 
 def _acted(agents: Agents, seen: Mapping[int, Observation], components: int) -> dict[int, Array | Exception]:
-    """Return lane → its action (D,), or what went wrong."""
+    """Return lane → its action (D,), or its error."""
     if not seen:
         return {}
     lanes = list(seen)
@@ -192,7 +192,7 @@ def _acted(agents: Agents, seen: Mapping[int, Observation], components: int) -> 
         if len(lanes) == 1:
             return {lanes[0]: error}
         return {lane: _acted(agents, {lane: seen[lane]}, components)[lane] for lane in lanes}
-    except Exception as error:  # of any kind: agents are what people write
+    except Exception as error:  # of any kind: agents are user code
         return dict.fromkeys(lanes, error)
     acted: dict[int, Array | Exception] = {}
     for lane, action in zip(lanes, actions, strict=True):
@@ -204,7 +204,7 @@ def _acted(agents: Agents, seen: Mapping[int, Observation], components: int) -> 
 
 
 def copied(seen: Observation) -> Observation:
-    """Return a copy with a state of 32 bits: a world may use its arrays again."""
+    """Return a copy, with a float32 state, because a world may reuse its arrays."""
     rgb, depth = ({name: np.array(image) for name, image in images.items()} for images in (seen.rgb, seen.depth))
     truth = None if seen.truth is None else {name: np.array(value) for name, value in seen.truth.items()}
     return replace(seen, rgb=rgb, depth=depth, truth=truth, state=np.array(seen.state, np.float32))

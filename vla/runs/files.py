@@ -24,14 +24,14 @@ from vla.rollouts.results import Report, Result
 from vla.spec import IN_DISTRIBUTION
 
 Node = dict[str, Any]
-# What reports read of a config, key → type; everything else is only shown.
+# Values of a config that reports use, key → type; everything else is only shown.
 READ: dict[str, Any] = {"task": dict[str, object], "task.tiers": dict[str, list[str]] | None}
 READ |= {"evaluate": dict[str, object]}
 READ |= {f"evaluate.{name}": each.annotation for name, each in arguments(Evaluation).items()}
 
 
 def readable_config(config: Node) -> Node:
-    """Return a config that reports can read; a UserError if one of its values is none of this project."""
+    """Return a config that reports can read; raise a UserError if a value that they use has the wrong type."""
     for key, kind in READ.items():
         if (value := at(config, key)) != ABSENT and (wrong := mismatch(f"config.{key}", value, kind)):
             raise UserError(wrong)
@@ -101,8 +101,8 @@ class Condition:
 
     __pydantic_config__ = LENIENT
 
-    outcomes: list[str]  # with `anytime`, of the first seeds
-    compared: dict[str, Comparison] = field(default_factory=dict)  # with the training condition, in success and others
+    outcomes: list[str]  # with `anytime`, perhaps of the first seeds only
+    compared: dict[str, Comparison] = field(default_factory=dict)  # with the training condition, metric → comparison
     # Per episode, as `outcomes`; empty in reports written before these were stored.
     reached: list[tuple[str, ...]] = field(default_factory=list)  # milestones
     motions: list[Motion | None] = field(default_factory=list)
@@ -131,7 +131,7 @@ class ReportFile:
     conditions: dict[str, Condition]
     config: Config
     per_episode: list[Result]
-    anytime: bool = False  # as of a condition
+    anytime: bool = False  # see `Condition`
     parameters: Count | None = None
     latency_ms: Positive | None = None
     versions: dict[str, str] = field(default_factory=dict)  # library → version
@@ -157,7 +157,7 @@ class ReportFile:
     def reports(self) -> dict[str, Report]:
         """Condition → report, the training condition first."""
         tiers = at(self.config, "task.tiers", None) or {}  # also with tasks that were not played
-        # Without tiers a condition may change what an episode asks for; a benchmark's task follows from the seed.
+        # Without tiers a condition may change the task of an episode; in a benchmark the task follows from the seed.
         tasks = [result.task if tiers else "" for result in self.per_episode]
         others = {name: part.report(self.seeds, tasks, tiers) for name, part in self.conditions.items()}
         return {IN_DISTRIBUTION: Report(tuple(self.per_episode), tiers, self.anytime), **others}

@@ -34,10 +34,10 @@ PAGE, RECORDING = "report.html", "rollouts.rrd"
 RECORDINGS = "recordings"  # folder of moving pictures, and of single recordings until, or unless, they are merged
 SAMPLES, PLOT, SUITE = "samples.png", "report.png", "suite.png"
 ERRORS, ERRORS_PLOT = "errors.json", "errors.png"  # of an open-loop evaluation, in place of a report
-LARGEST_METRIC, MOST_METRICS = 1e100, 300  # that curves are drawn of; a training has about 20
-LARGEST_METRICS = 64 << 20  # [bytes] that are read, a quarter of a million rows
+LARGEST_METRIC, MOST_METRICS = 1e100, 300  # limits for curves: value, and number; a training has about 20
+LARGEST_METRICS = 64 << 20  # [bytes] of metrics.csv that are read, about 250 000 rows
 LARGEST_REPORT = 4 << 30  # [bytes], a million episodes
-CHECKPOINTS, LAST = "checkpoints", "last.ckpt"  # what resumes a training: its folder, and the newest save
+CHECKPOINTS, LAST = "checkpoints", "last.ckpt"  # folder of a training's checkpoints, and the newest one
 
 
 @dataclass(frozen=True)
@@ -87,24 +87,24 @@ def read_run(folder: Path) -> Run:
 
 
 def read_report(folder: Path) -> ReportFile | None:
-    """Read the report of a run's folder, or return None; a UserError if the file is damaged."""
+    """Read the report of a run's folder, or return None; raise a UserError if the file is damaged."""
     return _read(folder / REPORT, partial(read_json, kind=ReportFile, largest=LARGEST_REPORT), None)
 
 
 def read_training(folder: Path) -> Training | None:
-    """Read the result of a run's training, or return None; a UserError if the file is damaged."""
+    """Read the result of a run's training, or return None; raise a UserError if the file is damaged."""
     return _read(folder / TRAINING, partial(read_json, kind=Training), None)
 
 
 def archive_evaluation(folder: Path, number: int) -> None:
-    """Rename report and recording after `number` steps, or rounds, because further training changes the policy."""
+    """Append `number`, of steps or rounds, to the names of an evaluation's files: more training changes the policy."""
     for file in (folder / name for name in (REPORT, ERRORS, RECORDING)):
         if file.exists():
             file.replace(folder / f"{file.stem}_{number}{file.suffix}")
 
 
 def require_run(folder: Path) -> Run:
-    """Read a run's folder; a UserError if it has no report, errors of an open-loop evaluation, or metrics."""
+    """Read a run's folder; raise a UserError if it has neither a report, nor open-loop errors, nor metrics."""
     if not any((folder / name).is_file() for name in (REPORT, ERRORS, METRICS)):
         raise UserError(f"{folder} is no run: it has none of {REPORT}, {ERRORS} and {METRICS}")
     return read_run(folder)
@@ -117,7 +117,7 @@ def save_config(folder: Path, config: Mapping[str, Any], changes: list[Node]) ->
 
 
 def described(files: Sequence[Path | None]) -> str:
-    """List those files of a folder that are there."""
+    """List the files of a folder that exist, the first one with its path."""
     first, *others = [file for file in files if file and file.is_file()]
     return ", ".join([str(first), *(file.name for file in others)])
 
@@ -147,10 +147,10 @@ def _curves(path: Path) -> dict[str, Curve]:
 
 
 def metric_rows(path: Path) -> list[dict[str, str]]:
-    """Read metrics.csv as rows of column → number, as text, without empty cells; each has a `step`.
+    """Read the rows of metrics.csv, column → number as text, without empty cells; each has a `step`.
 
-    Of a file larger than `LARGEST_METRICS` these are the last ones. There is a UserError if it has no steps or holds
-    something else than numbers.
+    Of a file larger than `LARGEST_METRICS` only the last rows are read. Raises a UserError if it has no steps, or holds
+    anything but numbers.
     """
     require_file(path)
     with path.open("rb") as file:

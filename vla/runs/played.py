@@ -1,4 +1,4 @@
-"""Results of an evaluation as they are played: the same command plays only what is missing."""
+"""Results of an unfinished evaluation, saved episode by episode: the same command plays only the missing ones."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Played:
     """Results so far, in a file that is removed at the end of this context, but stays after an error."""
 
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
-        """Continue the file in a run's folder if its first line is `head`, what determines the episodes; else begin it.
+        """Continue the file in a run's folder if its first line is `head`, which determines the episodes, or begin it.
 
-        An OSError tells that it cannot be written, a UserError that another process writes it.
+        Raises an OSError if it cannot be written, and a UserError if another process evaluates in the folder.
         """
         folder.mkdir(parents=True, exist_ok=True)
         busy = f"another process evaluates in {folder}: wait for it, or choose another output=DIR"
@@ -54,14 +54,14 @@ class Played:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Remove the file, unless it has something to continue with, and let others evaluate."""
+        """Remove the file, unless an error leaves results to continue with, and release the lock."""
         if kind is None or not any(self.results.values()):
             self._path.unlink(missing_ok=True)
-        Path(self._lock.lock_file).unlink(missing_ok=True)  # while it is held: who comes later makes a new one
+        Path(self._lock.lock_file).unlink(missing_ok=True)  # while it is held: a later process creates a new one
         self._lock.release()
 
     def add(self, condition: str, result: Result) -> None:
-        """Write the result of another episode; an OSError if the file cannot be written."""
+        """Write the result of another episode; raise an OSError if the file cannot be written."""
         with writing(self._path), self._path.open("a", encoding="utf-8") as file:
             file.write(_line((condition, asdict(result))))
         self.results[condition][result.seed] = result

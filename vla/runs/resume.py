@@ -27,10 +27,10 @@ LENGTHS = ("max_steps", "max_time")  # of the trainer
 
 
 def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | None, Path | None]:
-    """Return how far the training got that `config` describes in a folder; a UserError if it holds another one.
+    """Return the progress of the training of `config` in a folder; raise a UserError if it holds a different training.
 
-    The first result is the checkpoint of an unfinished training, the second the folder of the policy that a finished
-    one selected, which needs no checkpoint any more; both are None before its first save.
+    The first result is the checkpoint of an unfinished training, or None. The second is the folder of the policy that a
+    finished training selected, or None; it needs no checkpoint. Both are None before the first save.
     """
     last, chosen = folder / CHECKPOINTS / LAST, folder / POLICY
     if last.exists():
@@ -47,7 +47,7 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | N
     if changed and not longer and trainer["max_steps"] != saved.steps:
         log.warning("%s was trained for %d steps, more than trainer.max_steps", folder, saved.steps)
     if saved.finished and chosen.is_dir() and not longer:
-        require_identity(read_policy(chosen).config, config, folder)  # which is the one that is built
+        require_identity(read_policy(chosen).config, config, folder)  # which is what other jobs build
         log.info("training is already finished: %s", chosen)
         return None, chosen
     if not last.exists():
@@ -60,13 +60,13 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | N
 
 
 def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path, weights: str) -> float | None:
-    """Return the success rate of a run's report if it is of the same policy, with the digest `weights`, and the same
-    evaluation."""
+    """Return the success rate in a run's report; None unless it is of the same policy, with the digest `weights`, and
+    of the same evaluation, and without errors."""
     report = read_report(folder)
     if report is None or report.checkpoint != str(checkpoint) or report.weights != weights:
         return None
     against, nearest = config["evaluate"]["against"], config["evaluate"]["nearest"]
-    # The run that it compares with may have been evaluated again since, or more demonstrations been collected.
+    # Since then, the run to compare with may have been evaluated again, or more demonstrations collected.
     newer = [*([Path(against) / REPORT] if against else []), *([Path(nearest) / INDEX] if nearest else [])]
     if any(path.stat().st_mtime > (folder / REPORT).stat().st_mtime for path in newer):
         return None
@@ -77,7 +77,7 @@ def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path, we
 
 
 def newest_run(runs: Path) -> Path:
-    """Return the run in a folder that was trained last; a UserError if there is none."""
+    """Return the run in a folder that was trained last; raise a UserError if there is none."""
     files = [file for pattern in ("*", "*/round_*") for file in runs.glob(f"{pattern}/{CHECKPOINTS}/{LAST}")]
     if not files:
         raise UserError(f"resume=last: nothing was trained in {runs}; resume=DIR names a run elsewhere")
@@ -87,7 +87,7 @@ def newest_run(runs: Path) -> Path:
 
 @contextmanager
 def training_lock(folder: Path) -> Iterator[None]:
-    """Lock a folder of checkpoints, or of rounds; a UserError if another process holds the lock.
+    """Lock a folder of checkpoints, or of rounds; raise a UserError if another process holds the lock.
 
     Only the first process of a training takes it.
     """

@@ -54,8 +54,8 @@ class SweepRow:
         return {condition: sum(map(len, cells)) for condition, cells in self.played.items()}
 
     def interval(self, condition: str) -> tuple[float, float, float]:
-        """Return the success rate and its 95 % confidence interval, of several cells over trainings and scenes."""
-        if len(self.runs) == 1:  # its own: stratified with tiers, anytime-valid where playing stopped early
+        """Return the success rate and its 95 % confidence interval; of several cells, over trainings and scenes."""
+        if len(self.runs) == 1:  # the interval of its report: stratified with tiers, anytime-valid after early stopping
             report = self.runs[0].reports[condition]
             return (report.success, *report.interval)
         successes = sum(sum(cell.values()) for cell in self.played[condition])

@@ -19,14 +19,14 @@ from vla.parallel.limits import cores
 
 log = logging.getLogger(__name__)
 
-BUSY = 0.05  # share of all cores that spoils a figure when other programs use it
+BUSY = 0.05  # share of all cores; more use by other programs makes a figure unreliable
 MODULES = dict.fromkeys(("policy", "evaluate"), "acting")  # others are named like their stage
 
 
 def run(experiment: Experiment) -> dict[str, Measure]:
     """Measure the stages in `benchmark.names`, print a table and write `benchmark.json`; returns name → measure.
 
-    Both name the processor, and how many of its cores other programs used during a stage. There is a UserError if there
+    Both name the processor, and how many of its cores other programs used during a stage. Raises a UserError if there
     is no policy to evaluate.
     """
     from vla.reports.tables import Table  # imports matplotlib

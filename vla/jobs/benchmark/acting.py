@@ -1,4 +1,4 @@
-"""Speed of a policy: of an action, and of an evaluation."""
+"""Speed of a policy, per plan and in an evaluation."""
 
 from __future__ import annotations
 

@@ -20,15 +20,15 @@ from vla.rollouts.collect import DemonstrationWorker
 from vla.rollouts.rollout import replay, rollout
 from vla.spec import Agent, Environment, Episode
 
-FRAMES = 10  # of a renderer before it is the next one's turn
+FRAMES = 10  # that a renderer draws before it is the turn of the next one
 
 
 def collect(experiment: Experiment) -> dict[str, Measure]:
     """Measure control steps per second of one process with all cameras; the floor is physics and rendering alone.
 
-    Then the parts of a step, whose floor is the whole step; its images by each renderer, whose floor is the fastest;
-    and all processes, whose floor is that of one times their number. A world that can run the unavoidable part of a
-    step by itself has `minimal_step()`, which returns "physics" and "rendering" → a function that does it.
+    Also measure the parts of a step (floor: the whole step), the rendering of its images by each renderer (floor: the
+    fastest), and all processes together (floor: one process, times their number). A world that can run the unavoidable
+    part of a step by itself has `minimal_step()`, which returns "physics" and "rendering" → a function that does it.
     """
     count, unit = experiment.options(Benchmark).episodes, "control steps/s"
     makers = experiment.make_environment(), experiment.make_expert()
@@ -60,7 +60,7 @@ def collect(experiment: Experiment) -> dict[str, Measure]:
 def _timed_parts(environment: Environment, expert: Agent, count: int) -> tuple[list[Episode], dict[str, float]]:
     """Return episodes, and the time [s] of "full" rollouts, "blind" ones, "replay", and each call of `minimal_step`.
 
-    The parts of an episode follow each other, so that what else runs on the machine slows all alike.
+    The parts are timed in turns, episode by episode, so that other load on the machine slows all of them alike.
     """
     calls = getattr(environment, "minimal_step", dict)()
     episodes, taken = list[Episode](), dict.fromkeys((*calls, "full", "blind", "replay"), 0.0)
@@ -85,7 +85,7 @@ def _keep(store: EpisodeStore, episodes: list[Episode]) -> None:
 
 
 def _renderers(experiment: Experiment) -> dict[str, Measure]:
-    """Measure a step's images by every renderer of the task in turns; one with settings of the user's is "chosen"."""
+    """Measure the rendering of a step by every renderer of the task in turns; "chosen" is one with custom settings."""
     own, choice = experiment["task"].get("renderer"), _options()
     if own is None or own["_target_"] not in [node["_target_"] for node in choice.values()]:
         return {}

@@ -27,8 +27,8 @@ EPISODES, STEPS = 2500, 100  # of a store whose size is extrapolated
 def loader(experiment: Experiment) -> dict[str, Measure]:
     """Measure windows per second with the history of the model and others; the floor is a bare gather of the images.
 
-    Where the size of images is an option of the task, so is a store of large ones from three cameras in two codecs; the
-    floor of its size is the raw one.
+    If the task has an option for the image size, also measure large images from three cameras in two codecs, and the
+    size of their store; the floor of that size is the size of the raw images.
     """
     store = demonstrations(experiment)
     model = experiment.fitted_learner(store).model
@@ -83,7 +83,7 @@ def _loading(experiment: Experiment, store: EpisodeStore, history: int, chunk: i
         first = starts[np.searchsorted(starts, windows, side="right") - 1]
         rows.append(np.maximum(windows[:, None] + np.arange(1 - history, 1), first[:, None]))  # (B, T)
 
-    # Into two batches by turns, because one is in use while the next is made: a single one would stay in the cache.
+    # Fill two batches in turns, as one is in use while the next is made: a single one would stay in the cache.
     shapes = [(*rows[0].shape, *image.shape[1:]) for image in images]
     buffers = [[torch.empty(shape, dtype=torch.uint8).numpy() for shape in shapes] for _ in range(2)]
 

@@ -1,4 +1,4 @@
-"""A measurement beside its floor, and the machine that it is made on."""
+"""Measurements with their floors, and the machine on which they are made."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ def timed(work: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def machine() -> dict[str, Any]:
-    """Return the processor's name, the vector instructions that kernels use, and how many cores this process may."""
+    """Return the processor's name, the vector instructions that kernels use, and the number of usable cores."""
     instructions = torch.backends.cpu.get_cpu_capability()
     return {"processor": processor(), "instructions": instructions, "cores": cores()}
 
 
 def other_load() -> tuple[float, float]:
-    """Return the busy time of all cores but for that of this process and its ended children, and the time [s].
+    """Return the busy time of all cores, without that of this process and its ended children, and the time [s].
 
-    The quotient of the differences between two calls is how many cores other programs used meanwhile.
+    The quotient of their differences between two calls is the number of cores that other programs used meanwhile.
     """
     times = psutil.cpu_times()
     idle = times.idle + getattr(times, "iowait", 0.0) + getattr(times, "guest", 0.0)
