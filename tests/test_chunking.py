@@ -286,7 +286,7 @@ def test_what_cannot_continue_plans_is_refused() -> None:
         as_policy(make_act(), chunking=METHODS["guided"]())
     with pytest.raises(ValueError, match=r"TrainedPrefix needs a model that was trained with prefixes: model"):
         as_policy(make_flow(prefix=0), chunking=TrainedPrefix())
-    with pytest.raises(ValueError, match=r"model\.chunk=8 has no room for model\.prefix=7 and the model\.execute=2"):
+    with pytest.raises(ValueError, match=r"model\.chunk=8 has no room for model\.prefix=7 and model\.execute=2"):
         make_flow(prefix=7)
     require_fit(TrainedPrefix, {"chunk": 8, "execute": 2, "prefix": 4}, delay=4)
     with pytest.raises(ValueError, match=r"begin 5 actions apart and arrive 5 late, when model\.chunk=8 has run out"):

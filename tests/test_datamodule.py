@@ -201,7 +201,7 @@ def test_training_leaves_the_store_as_it_is(folder: Path, tmp_path: Path) -> Non
 def test_what_cannot_be_trained_on_is_refused(folder: Path) -> None:
     with pytest.raises(ValueError, match=r"the model has control_hz = 5\.0, but the episode store .* has 10\.0"):
         windows(folder, spec=replace(toy.SPEC, control_hz=5.0))
-    with pytest.raises(ValueError, match=r"1 episodes leave 0 for training and 1 for .*: raise collect\.episodes"):
+    with pytest.raises(ValueError, match=r"of 1 episode 0 would train, 1 validate: raise collect\.episodes"):
         windows(folder, episodes=1)
 
 

@@ -48,7 +48,7 @@ def test_it_is_said_before_and_compared_after(
         train(make_bc(), folder, tmp_path, killer=Estimate(SIZES), max_steps=4, accumulate_grad_batches=2)
     said, took = (each.getMessage() for each in caplog.records if each.name == estimate.__name__)
     numbers = re.match(
-        r"needs about ([\d.]+) of ([\d.]+) GB of memory, [\d.]+ of which it has, and [\d.]+ minutes for 8 batches of "
+        r"needs about ([\d.]+) of ([\d.]+) GB of memory, [\d.]+ of which it has, and [\d.]+ min for 8 batches of "
         rf"(\d+) ms, without validation{advice}",
         said,
     )

@@ -78,7 +78,7 @@ def test_more_values_than_there_are_tokens_or_characters_are_refused(bins: int, 
 
 
 def test_chunks_of_another_length_are_refused() -> None:
-    with pytest.raises(UserError, match=r"predicts 4 actions, its tokenizer 8: set tokenizer\.chunk=4"):
+    with pytest.raises(UserError, match=r"has chunks of 4, its tokenizer of 8: set tokenizer\.chunk=4"):
         TOKENIZER.length(4)
 
 

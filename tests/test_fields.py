@@ -151,7 +151,7 @@ def test_damaged_images_of_several_episodes_are_named_by_seed(tmp_path: Path) ->
     with pytest.raises(ValueError, match=r"the rows of the seeds 0, 1, 2, 4 in .* were changed on disk"):
         WindowBatcher(store, 1, 1).verify()
     found = verify_store(store)
-    with pytest.raises(ValueError, match=r"4 damaged .* \(seeds 0, 1, 2, 4: rgb_wrist of step 0 changed or lost\)"):
+    with pytest.raises(ValueError, match=r"4 damaged .* \(4 seeds, 0, 1, 2, 4: rgb_wrist of step 0 changed or lost\)"):
         require_whole(found)
     found.damaged.update({f"rgb_front of step {step} changed or lost": [step] for step in range(20)})
     with pytest.raises(ValueError, match=r"24 damaged .*: rgb_front of step 6 changed or lost; and 13 others\)"):

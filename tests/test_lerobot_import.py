@@ -290,7 +290,7 @@ def test_every_step_has_the_instruction_of_its_task(home: Path, tmp_path: Path, 
     assert recording(dataset).episodes == 5
     caplog.set_level("INFO")
     found = imported(dataset, tmp_path / "store", 5)
-    assert "3 episodes become 5" in caplog.text
+    assert "episodes: 3 become 5" in caplog.text
     assert [entry.instruction for entry in found.episodes] == ["reach", "grasp", "reach", "grasp", "reach"]
     assert [entry.recording for entry in found.episodes] == [0, 0, 1, 1, 2]
     assert [entry.draws["recorded"]["first_step"] for entry in found.episodes] == [0, 4, 0, 4, 0]

@@ -23,6 +23,7 @@ from toy_recordable import ThinkingAgent, make_environment
 
 from vla.config.differences import differences
 from vla.config.origin import Origin
+from vla.data.index import Entry, index_line
 from vla.io.files import warn_on_error
 from vla.reports.comparison import compare, read_runs, rows_of
 from vla.reports.comparison_page import tabulate
@@ -137,6 +138,56 @@ def test_the_page_says_what_was_recorded_and_how_to_play_an_episode_again(
     monkeypatch.chdir(tmp_path)
     again = "checkpoint=run/policy evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
     assert again not in told and again in text(write_page(folder))  # relative to the working directory
+
+
+def test_recordings_of_single_episodes_are_linked(tmp_path: Path) -> None:
+    folder = a_run(tmp_path / "run")
+    (folder / "recordings").mkdir()
+    for number in range(23):
+        (folder / f"recordings/success-{number:08d}.rrd").touch()
+    page = write_page(folder)
+    links = re.findall(r'href="(recordings/[^"]*)"', page.read_text())
+    assert links == [f"recordings/success-{number:08d}.rrd" for number in range(20)]
+    assert "success-00000019.rrd and 3 more in recordings" in text(page)
+
+
+def test_an_agent_without_a_checkpoint_is_named_to_play_an_episode_again(tmp_path: Path) -> None:
+    folder = a_run(tmp_path / "run")
+    change(folder, lambda content: content.update(checkpoint=None))
+    save_config(folder, {**CONFIG, "chosen": {"agent": "expert"}}, [])
+    (folder / "rollouts.rrd").touch()
+    again = (
+        "python -m vla.run agent=expert evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all, and the task"
+    )
+    assert again in text(write_page(folder))
+
+
+def test_rounds_are_linked_with_success_from_one_to_the_next(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "run", "sssd")
+    for number, outcomes in enumerate(["", "sd", "sss"]):
+        folder = a_run(run / f"round_{number}", curves=f"step,val/success\n9,0.1\n19,0.{number}5\n")
+        (folder / "episodes").mkdir()
+        entries = [
+            Entry(seed, "", "success" if each == "s" else "dropped", (), "", 3 * seed, 3, {}, {})
+            for seed, each in enumerate(outcomes)
+        ]
+        (folder / "episodes/index.jsonl").write_bytes(b"".join(map(index_line, entries)))
+        save_training(folder, Training(1, 20, 30.0, "done"))
+        write_page(folder)
+    told, markup = text(write_page(run)), (run / "report.html").read_text()
+    assert "round 0 5.0 20 30 s round 1 50.0 (9.5-90.5) 1/2 15.0 20 30 s round 2 100.0 (43.9-100.0) 3/3 25.0" in told
+    assert "evaluation 75.0 (30.1-95.4) 3/4" in told
+    assert [f"round_{number}/report.html" for number in range(3)] == re.findall(r'href="(round_[^"]*)"', markup)
+    assert "Rounds with the expert" not in text(run / "round_1/report.html")
+
+
+def test_what_a_round_was_trained_on_is_told(tmp_path: Path) -> None:
+    config = {"collect": {"episodes": 1, "more": ["round_1/episodes"]}, "pretrained": "round_0/policy"}
+    save_config(tmp_path, config | {"task": {"goal": {"_target_": "vla.tasks.goals.PickPlace"}}}, [])
+    save_training(tmp_path, Training(1, 1, 3.0, "done"))
+    told = text(write_page(tmp_path))
+    assert told.startswith("pick place ") and "training 1 step in 3 s" in told
+    assert "demonstrations 1 and those in [round_1/episodes] from weights of round_0/policy" in told
 
 
 def test_the_page_tells_the_command_the_commit_and_the_machine(tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def test_only_episodes_that_ended_in_an_error_are_played_again(tmp_path: Path, w
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Perturbed, "act", act_once)
         failed = here(tmp_path, *COMMAND, "output=run", ok=False)
-    assert "1 episodes ended in an error, see run/report.json" in failed.stderr
+    assert "1 episode ended in an error, see run/report.json" in failed.stderr
     done = here(tmp_path, *COMMAND, "output=run")
     assert f"episodes already played: {2 * EPISODES - 1}, in" in done.stdout + done.stderr
     assert reported(tmp_path / "run") == whole

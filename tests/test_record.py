@@ -110,7 +110,7 @@ def test_merging_refuses_nothing_and_nonsense(tmp_path: Path) -> None:
         merge([], tmp_path / "rollouts.rrd")
     nonsense = tmp_path / "nonsense.rrd"
     nonsense.write_text("this is no recording")
-    with pytest.raises(ValueError, match="could not merge 1 recordings"):
+    with pytest.raises(ValueError, match="could not merge 1 recording into"):
         merge([nonsense], tmp_path / "rollouts.rrd")
     assert list(tmp_path.iterdir()) == [nonsense]
 

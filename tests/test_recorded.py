@@ -176,7 +176,7 @@ def test_a_repaired_import_goes_on(dataset: Path, tmp_path: Path) -> None:
         store.fail(replace(recorded.episode(1), outcome="damaged"))
     assert recorded.fill(store, EPISODES - 1) == EPISODES - 2
     assert [entry.seed for entry in store.episodes] == [0, *range(2, EPISODES)]
-    with pytest.raises(ValueError, match=rf"only {EPISODES - 1} episodes are whole"):
+    with pytest.raises(ValueError, match=rf"only {EPISODES - 1} whole episodes"):
         recorded.fill(EpisodeStore(tmp_path / "store"), EPISODES)
     derive_store([EpisodeStore(tmp_path / "store")], tmp_path / "chosen", {"seed": 0})
     with pytest.raises(ValueError, match=r"cannot grow: set collect\.episodes=1"):

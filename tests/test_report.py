@@ -76,6 +76,12 @@ def test_rates_share_a_scale_that_shows_their_intervals(tmp_path: Path, figures:
     assert {axes.get_ylim() for axes in panels} == {(0.9, 1.0)}
 
 
+def test_equal_lengths_have_one_tick(tmp_path: Path, figures: list[Figure]) -> None:
+    plot_report(Report((Result(FIRST_SEED, "success", steps=100),)), tmp_path / "report.png")
+    low, high = figures[0].axes[1].get_xlim()
+    assert [tick for tick in figures[0].axes[1].get_xticks() if low <= tick <= high] == [100]
+
+
 def test_success_without_a_failure_depends_on_nothing(tmp_path: Path, figures: list[Figure]) -> None:
     played = [Result(FIRST_SEED + index, "success", draws={"even": index % 2}) for index in range(20)]
     plot_report(Report(tuple(played)), tmp_path / "report.png")

@@ -351,7 +351,7 @@ def test_only_so_many_come_in_and_only_with_the_key() -> None:
         assert threading.active_count() <= before
         with client(url, **key) as connection:
             connection.recv()
-            with pytest.raises(ValueError, match=r"failed: 1 clients are connected: raise deploy\.connections"):
+            with pytest.raises(ValueError, match=r"failed: no room beside 1 client: raise deploy\.connections"):
                 remote(url, api_key="open")
         remote(url, api_key="open").close()
 

@@ -14,6 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 
 from vla.config.packages import config_folders, option_packages, trusted
 from vla.io.documents import STRICT
+from vla.io.errors import counted
 from vla.parallel.limits import cores, processor
 
 SECRET = "api_key"  # key whose values are written to no file
@@ -39,7 +40,7 @@ def find_origin() -> Origin:
     command = "" if overrides is None else f"python -m vla.run {shlex.join(map(_without_secret, overrides))}".strip()
     torch = sys.modules.get("torch")
     gpu = f", {torch.cuda.get_device_name()}" if torch and torch.cuda.is_available() else ""
-    return Origin(command, _commits(), socket.gethostname(), f"{processor()}, {cores()} cores{gpu}")
+    return Origin(command, _commits(), socket.gethostname(), f"{processor()}, {counted(cores(), 'core')}{gpu}")
 
 
 def _without_secret(override: str) -> str:

@@ -25,7 +25,7 @@ from torch import Tensor
 from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
 from vla.data.window_batches import Batch, WindowBatcher, joined
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.types import Count, Natural, Rate, Seed
 from vla.spec import Array, Spec
 
@@ -152,7 +152,7 @@ class WindowDataModule(LightningDataModule):
         episodes = [entry for store in stores for entry in store.episodes]
         if not trained or (self._fraction > 0 and not unseen):
             raise UserError(
-                f"{len(episodes)} episodes leave {len(trained)} for training and {len(unseen)} for validation: raise "
+                f"of {counted(len(episodes), 'episode')} {len(trained)} would train, {len(unseen)} validate: raise "
                 f"collect.episodes, or set data.validation_fraction (now {self._fraction})"
             )
         self._digest = digest_of(episodes)
@@ -185,8 +185,8 @@ class WindowDataModule(LightningDataModule):
         before, batch, processes = state["batch"], self.batch_size * self._place()[1], self._place()[1]
         if before != batch:
             raise UserError(
-                f"the resumed training had batches of {before} windows, and {processes} processes have batches of "
-                f"{batch}: train on as many devices as before"
+                f"the resumed training had batches of {before} windows, and {counted(processes, 'process')} would have "
+                f"batches of {batch}: train on as many devices as before"
             )
         if state["windows"] != self._digest:
             raise UserError(

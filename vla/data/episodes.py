@@ -31,7 +31,7 @@ from vla.data.header import RAW, Codec, fields_of, is_store, read_header, write_
 from vla.data.index import INDEX, REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
 from vla.data.statistics import Statistics
 from vla.io.documents import canonical
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.files import require_file
 from vla.parallel.limits import memory
 from vla.spec import FIRST_SEED, Array, Episode, Observation, Spec
@@ -303,8 +303,8 @@ class EpisodeStore:
             self._rows += entry.steps
             self._index_size += len(line)
         except OSError as error:
-            safe = f"the {len(self.episodes)} episodes before it are safe, make room and run again to continue"
-            raise UserError(f"{self.folder} cannot take seed {entry.seed} ({error.strerror}): {safe}") from error
+            way_out = f"make room and run again to continue after {counted(len(self.episodes), 'safe episode')}"
+            raise UserError(f"{self.folder} cannot take seed {entry.seed} ({error.strerror}): {way_out}") from error
         finally:
             self._cut()  # nothing to do after a success; after an error, or Ctrl-C, what was half written
 

@@ -13,7 +13,7 @@ import numpy as np
 from annotated_types import Ge, Le, MaxLen, Predicate
 
 from vla.io.documents import STRICT, parse_json, read_bounded
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.types import Seed
 from vla.spec import LONGEST_INSTRUCTION, Name
 
@@ -128,7 +128,7 @@ def listed(numbers: Sequence[int]) -> str:
     ordered = sorted(set(numbers))
     if len(ordered) > 2 and ordered[-1] - ordered[0] == len(ordered) - 1:
         return f"{ordered[0]} to {ordered[-1]}"
-    more = f" and {len(ordered) - MAX_LISTED} others" if len(ordered) > MAX_LISTED else ""
+    more = f" and {counted(len(ordered) - MAX_LISTED, 'other')}" if len(ordered) > MAX_LISTED else ""
     return ", ".join(map(str, ordered[:MAX_LISTED])) + more
 
 

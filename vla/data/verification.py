@@ -13,7 +13,7 @@ import numpy as np
 
 from vla.data.episodes import DamageError, EpisodeStore, observations_of
 from vla.data.index import DAMAGED, LOST, MAX_LISTED, NOT_NEEDED, Entry, listed
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.printable import track
 from vla.spec import Array, Episode
 
@@ -77,11 +77,11 @@ def require_whole(report: StoreReport) -> None:
     """Raise a UserError if a store has damaged episodes or none."""
     folder, count = report.store.folder, sum(map(len, report.damaged.values()))
     if report.damaged:
-        problems = [f"seeds {listed(seeds)}: {problem}" for problem, seeds in report.damaged.items()]
-        more = [f"and {len(problems) - MAX_LISTED} others"] if len(problems) > MAX_LISTED else []
+        problems = [f"{counted(len(seeds), 'seed')}, {listed(seeds)}: {what}" for what, seeds in report.damaged.items()]
+        more = [f"and {counted(len(problems) - MAX_LISTED, 'other')}"] if len(problems) > MAX_LISTED else []
         named = "; ".join([*problems[:MAX_LISTED], *more])
         raise UserError(
-            f"{folder} has {count} damaged episodes ({named}): inspect.repair=true leaves them out of a copy"
+            f"{folder} has {counted(count, 'damaged episode')} ({named}): inspect.repair=true copies what is whole"
         )
     report.store.require_episodes()
 

@@ -14,7 +14,7 @@ from vla.deploy.record import BagRecorder
 from vla.deploy.ros import arguments as ros_arguments
 from vla.deploy.ros import plain_errors, ros
 from vla.deploy.ros2 import PolicyDeployment, SimulatorDeployment
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.types import Count
 from vla.parallel.processes import leave_with_parent, without_triton
 from vla.rollouts.results import ERROR, Report, Result
@@ -54,7 +54,7 @@ class Loop:
         """
         with self.running() as operator:
             results: list[Result] = []
-            log.info("playing %d episodes", self.episodes)
+            log.info("playing %s", counted(self.episodes, "episode"))
             while len(results) < self.episodes and not operator.stopped.is_set():
                 try:
                     result = operator.play()

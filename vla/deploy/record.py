@@ -17,7 +17,7 @@ from typing import Any
 from vla.deploy.bag import message_types, rosbags
 from vla.deploy.messages import shorten
 from vla.deploy.ros import NETWORKS, command_node, spin
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 
 DISCOVERY_PERIOD = 0.5  # between two queries for new topics [s]
 MESSAGE_PACKAGES = ("sensor_msgs", "std_msgs", "trajectory_msgs", "geometry_msgs", "diagnostic_msgs", "rosgraph_msgs")
@@ -86,7 +86,7 @@ def main() -> None:
     with command_node("vla_record", options.network) as (node, stopped):
         with closing(BagRecorder(node, options.folder)) as recorder:
             spin(node, stopped)
-        print(f"{recorder.messages} messages in {options.folder}")
+        print(f"{counted(recorder.messages, 'message')} in {options.folder}")
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ from websockets.http11 import Request, Response
 
 from vla.deploy.client_observation import Keys, instruction
 from vla.io.array_messages import pack, unpack
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.types import Count, Text
 from vla.parallel.processes import stopped_by
 from vla.spec import Array, Environment, Observation
@@ -42,7 +42,7 @@ from vla.spec import Array, Environment, Observation
 if TYPE_CHECKING:
     from vla.policy import Policy
 
-FULL = "{} clients are connected: raise deploy.connections, or lower their cluster.workers\n"
+FULL = "no room beside {}: raise deploy.connections, or lower their cluster.workers\n"
 PATIENCE = 3.0  # longest opening or closing of a connection by a client [s]
 WARNINGS = 20  # most warnings about clients in a minute
 INVALID, TOO_BIG, INTERNAL = 1007, 1009, 1011  # WebSocket close codes: invalid data, too large, error in the server
@@ -157,7 +157,7 @@ class Service:
         ):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "send the API key as Authorization: Api-Key …\n")
         if len(self._lanes) >= self._settings.connections:
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, FULL.format(len(self._lanes)))
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, FULL.format(counted(len(self._lanes), "client")))
         return None
 
     async def _talk(self, connection: ServerConnection) -> None:

@@ -1,4 +1,4 @@
-"""The error for everything that a user can fix, and the suggestion for a misspelt name."""
+"""The error for everything that a user can fix, and words of messages: counts, and suggestions for a misspelt name."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ class UserError(ValueError):
 
     The entry point prints the text alone. Every other exception is a bug and keeps its traceback.
     """
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number and its noun, which is in the plural unless the number is 1."""
+    return f"{number} {noun}{'' if number == 1 else 'es' if noun.endswith(('s', 'ch')) else 's'}"
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

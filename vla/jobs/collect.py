@@ -9,7 +9,7 @@ from vla.config.experiment import Experiment
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import ImportedDemonstrations
 from vla.data.header import is_store
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.rollouts.collect import collect
 from vla.spec import FIRST_SEED, Environment, Multitask, Spec, SpecOnly
 
@@ -42,7 +42,7 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
             log.warning(
                 "%s was derived from demonstrations with another %s", store.folder, " and another ".join(others)
             )
-        log.info("%s: %d of its %d episodes, none of them new", store.folder, wanted.episodes, len(store.episodes))
+        log.info("%s: %s of %d, none new", store.folder, counted(wanted.episodes, "episode"), len(store.episodes))
     return EpisodeStore(store.folder, wanted.episodes)
 
 
@@ -85,17 +85,18 @@ def _fill(experiment: Experiment) -> EpisodeStore:
     store = EpisodeStore.create_or_open(Path(wanted.folder), spec, experiment.source, wanted.codec)
     if recorded is not None:
         added = recorded.fill(store, wanted.episodes)
-        log.info("%s: %d recorded episodes, %d of them new", store.folder, len(store.episodes), added)
+        log.info("%s: %s, %d of them new", store.folder, counted(len(store.episodes), "recorded episode"), added)
         return store
     makers = experiment.make_environment(), experiment.make_expert()
     multitask = world if isinstance(world, Multitask) else None
     summary = collect(store, *makers, wanted.episodes, cluster, wanted.seed, multitask)
     if len(summary.tasks) > 1:
         for task, (solved, tried) in summary.tasks.items():
-            log.info("%s: %d episodes of %d seeds", task, solved, tried)
+            log.info("%s: %s of %s", task, counted(solved, "episode"), counted(tried, "seed"))
     failures = ", ".join(f"{count} {cause}" for cause, count in summary.failures.items()) or "none"
     log.info(
-        "%s: %d episodes, %d of them new in %.0f s; expert success %.1f %%, failures: %s",
-        *(store.folder, summary.episodes, summary.added, summary.seconds, 100 * summary.success_rate, failures),
+        "%s: %s, %d of them new in %.0f s; expert success %.1f %%, failures: %s",
+        *(store.folder, counted(summary.episodes, "episode"), summary.added, summary.seconds),
+        *(100 * summary.success_rate, failures),
     )
     return store

@@ -20,7 +20,7 @@ from vla.config.differences import NOT_COMPARED
 from vla.config.experiment import Experiment
 from vla.config.nodes import NEAREST, Evaluation, with_changes
 from vla.data.index import INDEX
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.files import warn_on_error, writing
 from vla.io.printable import printable, show
 from vla.io.versions import installed_versions
@@ -115,7 +115,7 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
                 facts = {**_facts(experiment, checkpoint), "weights": weights, "statements": said}
                 _write(experiment, checkpoint, reports, facts)
             if errors := _errors(reports):  # what was played is kept, so that the same command plays only these again
-                raise UserError(f"{errors} episodes ended in an error, see {output / REPORT}")
+                raise UserError(f"{counted(errors, 'episode')} ended in an error, see {output / REPORT}")
     finally:
         for line in conclusions:  # after whatever was logged, because scripts read the last line
             print(printable(line))

@@ -22,7 +22,7 @@ from vla.config.nodes import Rounds, with_changes
 from vla.data.episodes import EpisodeStore
 from vla.data.header import is_store
 from vla.data.index import listed
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.jobs.collect import complete_store, demonstrations
 from vla.jobs.evaluate import evaluated, policy_for_workers, require_possible
 from vla.jobs.train import train
@@ -30,13 +30,11 @@ from vla.models.policy_folder import read_policy
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import close_agent
 from vla.rollouts.supervised import make_supervised, require_memoryless
-from vla.runs.folder import archive_evaluation, read_report, read_run, save_config
+from vla.runs.folder import EPISODES, archive_evaluation, read_report, read_run, save_config
 from vla.runs.resume import LENGTHS, training_lock
 from vla.spec import FIRST_SEED
 
 log = logging.getLogger(__name__)
-
-EPISODES = "episodes"  # the store in the folder of a round
 
 
 def run(experiment: Experiment) -> float:
@@ -66,7 +64,7 @@ def _improved(experiment: Experiment, seeds: range) -> float:
         store = _labelled(experiment, checkpoint, folder / EPISODES, seeds[(number - 1) * asked.episodes])
         stores.append(store.folder)
         successes = sum(entry.success for entry in store.episodes)
-        log.info("round %d: %d of %d labelled episodes were successes", number, successes, len(store.episodes))
+        log.info("round %d: success in %d of %s", number, successes, counted(len(store.episodes), "labelled episode"))
         checkpoint = _trained(_round(experiment, checkpoint, folder, stores))
     return evaluated(experiment, checkpoint)
 

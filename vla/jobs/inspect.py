@@ -14,7 +14,7 @@ from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.index import listed
 from vla.data.verification import find_episode, require_whole, verify_store
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.files import warn_on_error
 from vla.io.printable import show
 from vla.reports.dataset_card import store_table, write_card
@@ -65,7 +65,7 @@ def _chosen(wanted: Inspection) -> Path:
     damaged = derive_store(sources, new, wanted.where, wanted.repair)
     log.info("wrote %s; its sources are unchanged", new)
     if damaged:
-        log.warning("%d damaged seeds now count as failed: %s", len(damaged), listed(damaged))
+        log.warning("counted as failed from now on: %s, %s", counted(len(damaged), "damaged seed"), listed(damaged))
     return new
 
 

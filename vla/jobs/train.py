@@ -17,7 +17,7 @@ from lightning import Callback, LightningModule, Trainer
 from vla.config.experiment import Experiment, training_policy
 from vla.data.datamodule import WindowDataModule
 from vla.data.episodes import EpisodeStore
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.files import atomic_path, remove_drafts, warn_on_error, writing
 from vla.jobs.collect import demonstration_spec, demonstrations
 from vla.models.diffusion import Diffusion
@@ -112,8 +112,8 @@ def warn_of_length(experiment: Experiment) -> None:
         text = "trainer.max_steps=%d ends within learner.warmup_steps=%d: the learning rate does not reach its peak"
         log.warning(text, steps, warmup)
     if interval > (batches := steps * trainer["accumulate_grad_batches"]):
-        text = "trainer.val_check_interval=%d is more than the %d batches: no validation, and the last weights are used"
-        log.warning(text, interval, batches)
+        text = "trainer.val_check_interval=%d is more than the %s: no validation, and the last weights are used"
+        log.warning(text, interval, counted(batches, "batch"))
 
 
 def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_stop: GracefulStop) -> None:
@@ -253,4 +253,4 @@ def _reported(
             with warn_on_error(output / PAGE):
                 write_page(output)
         end_wandb()
-    log.info("trained %d steps in %.0f s", trainer.global_step, graceful_stop.seconds)
+    log.info("trained %s in %.0f s", counted(trainer.global_step, "step"), graceful_stop.seconds)

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.types import Positive
 
 # Noisy actions (B, k, D) and their times, (B,) or (B, k), from 0 for noise to 1 for actions → velocity (B, k, D).
@@ -115,8 +115,8 @@ def require_prefix(prefix: int, execute: int, chunk: int) -> None:
     """Raise a UserError if a chunk has fewer actions after its prefix than are executed."""
     if prefix + execute > chunk:
         raise UserError(
-            f"model.chunk={chunk} has no room for model.prefix={prefix} and the model.execute={execute} actions that "
-            "follow it: lower one of these, or raise model.chunk"
+            f"model.chunk={chunk} has no room for model.prefix={prefix} and model.execute={execute} after it: "
+            "lower one of these, or raise model.chunk"
         )
 
 
@@ -126,8 +126,8 @@ def require_fit(method: type, model: Mapping[str, Any], delay: int) -> None:
     interval = max(delay, model["execute"] or chunk)  # between one plan and the next
     if delay + interval > chunk:
         raise UserError(
-            f"plans begin {interval} actions apart and arrive {delay} late, when model.chunk={chunk} has run out: "
-            "train with a larger one, or lower the delay or model.execute"
+            f"plans begin {counted(interval, 'action')} apart and arrive {delay} late, when model.chunk={chunk} has "
+            "run out: train with a larger one, or lower the delay or model.execute"
         )
     if issubclass(method, TrainedPrefix) and delay > (prefix := model["prefix"]):
         raise UserError(f"plans arrive {delay} actions late, but the model was trained for model.prefix={prefix}")

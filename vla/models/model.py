@@ -89,7 +89,7 @@ class Model(nn.Module, ABC):
         super().__init__()
         self.chunk, self.execute = chunk, chunk if execute is None else execute
         if self.execute > chunk:
-            raise UserError(f"model.execute={execute} is more than the model.chunk={chunk} actions that are predicted")
+            raise UserError(f"model.execute={execute} is more than model.chunk={chunk}, the actions that are predicted")
         self.width, self.spec, self.tokenizer = width, spec, tokenizer
         self.text = text(width=text_width)
         self.image_size = image_size or spec.image_size

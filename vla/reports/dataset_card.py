@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from vla.data.episode_filter import flat, leaves
 from vla.data.index import NOT_NEEDED, listed
 from vla.data.verification import StoreReport, entries_by_config, episode_of
+from vla.io.errors import counted
 from vla.io.files import write_text
 from vla.reports.factors import numeric
 from vla.reports.observations import reset_panels, spans
@@ -35,7 +36,7 @@ def store_table(findings: StoreReport) -> Table:
     tried = [entry.seed for entry in store.tried if entry.outcome != NOT_NEEDED]
     instructions = _most([entry.instruction for entry in findings.whole])
     rows = {
-        "episodes": f"{len(findings.whole)} intact, of {len(tried)} seeds tried: {listed(tried)}",
+        "episodes": f"{len(findings.whole)} intact, of {counted(len(tried), 'seed')} tried: {listed(tried)}",
         "steps": f"{sum(lengths)}, from {min(lengths)} to {max(lengths)} in an episode",
         "time": f"{60 * findings.hours:.1f} min at {spec.control_hz:g} Hz",
     }
@@ -55,7 +56,7 @@ def write_card(findings: StoreReport) -> Path:
     """Write `card.md` and `card.png` into the folder of a store with intact episodes; return the path of `card.md`."""
     assert findings.whole, "no episode is intact"
     folder = findings.store.folder
-    save(folder / "card.png", _panels(findings), COLUMNS, (4, 1.9), f"{len(findings.whole)} episodes")
+    save(folder / "card.png", _panels(findings), COLUMNS, (4, 1.9), counted(len(findings.whole), "episode"))
     write_text(folder / "card.md", _text(findings))
     return folder / "card.md"
 
@@ -76,7 +77,8 @@ def _text(findings: StoreReport) -> str:
     ]
     for config, entries in entries_by_config(store):
         content = json.dumps(config, indent=1, ensure_ascii=False)
-        parts.append(f"{len(entries)} seeds, {listed([each.seed for each in entries])}:\n\n```json\n{content}\n```\n")
+        tried = [each.seed for each in entries]
+        parts.append(f"{counted(len(tried), 'seed')}, {listed(tried)}:\n\n```json\n{content}\n```\n")
     return "\n".join(parts)
 
 
@@ -85,7 +87,7 @@ def _most(values: Sequence[str]) -> dict[str, int]:
     counts = Counter(values)
     shown = dict(counts.most_common(WORDS))
     others = len(counts) - len(shown)
-    return shown if not others else {**shown, f"({others} others)": counts.total() - sum(shown.values())}
+    return shown if not others else {**shown, f"({counted(others, 'other')})": counts.total() - sum(shown.values())}
 
 
 def _panels(findings: StoreReport) -> Panels:

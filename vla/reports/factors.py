@@ -99,7 +99,7 @@ def _plot_lengths(axes: Axes, played: Sequence[Result]) -> None:
     width = max(1, round((max(lengths) - min(lengths)) / LENGTH_BINS))
     edges = np.arange(min(lengths), max(lengths) + width + 1, width) - 0.5  # whole numbers lie inside the bins
     axes.hist(steps, bins=list(edges), stacked=True, color=[GREEN, RED])
-    axes.locator_params(integer=True, nbins=5)
+    axes.locator_params(integer=True, nbins=5, min_n_ticks=1)  # of equal lengths there is one
 
 
 def _plot_points(axes: Axes, points: Sequence[tuple[float, float]], played: Sequence[Result]) -> None:

@@ -41,7 +41,7 @@ def draws_table(seeds: Sequence[int], draws: Sequence[Mapping[str, Any]]) -> Tab
     for name, span in spans(draws).items():
         values = [f"{leaf:.3g}" if isinstance(leaf, float) else str(leaf) for leaf in leaves(first.get(name))]
         rows.append([name, span, " ".join(values)])
-    return Table(("draw", "range", f"seed {seeds[0]}"), rows, f"{len(draws)} resets")
+    return Table(("draw", "range", f"seed {seeds[0]}"), rows, f"resets: {len(draws)}")
 
 
 def spans(draws: Sequence[Mapping[str, Any]]) -> dict[str, str]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from vla.io.errors import counted
 from vla.io.files import write_json
 from vla.io.printable import readable
 from vla.reports.pictures import BLUE, GREEN, GREY, MIDDLE, Panels, save
@@ -62,7 +63,7 @@ def errors_table(errors: Sequence[ComponentError], episodes: int) -> Table:
     heads = ("component", "unit", "error", "95 % CI", "of a constant action")
     if not any(unit for _, unit, *_ in rows):  # recordings have no units
         heads, rows = tuple(head for head in heads if head != "unit"), [[name, *rest] for name, _, *rest in rows]
-    return Table(heads, rows, f"Mean absolute errors on {episodes} held-out episodes", NOTE)
+    return Table(heads, rows, f"Mean absolute errors on {counted(episodes, 'held-out episode')}", NOTE)
 
 
 def plot_errors(result: OpenLoop, path: Path) -> None:

@@ -13,7 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from vla.io.documents import read_bounded
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.files import write_text
 from vla.reports.tables import DIFFERENCE, Table, in_words
 from vla.rollouts.moving_picture import LARGEST
@@ -58,7 +58,7 @@ def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bo
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters.update(embedded=_embedded, in_words=in_words)
+    environment.filters.update(embedded=_embedded, in_words=in_words, counted=counted)
     parts = [part for part in parts if part.rows]
     compares = any(isinstance(part, Table) and {*DIFFERENCE} <= {*part.heads} for part in parts)
     notes = f"{RATES} {COMPARED}" if compares else RATES

@@ -38,15 +38,16 @@ def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Mappi
     rows = []
     for name, report in reports.items():
         if name not in equal:
-            rows.append([name, *_cells(report.counted()), *difference(compared.get(name, {}).get(SUCCESS))])
+            rows.append([name, *cells(report.counted()), *difference(compared.get(name, {}).get(SUCCESS))])
             tasks = report.tasks if detailed and len(report.tasks) > 1 else {}
-            rows += [[f"  {task}", *_cells(part.counted()), *difference(None)] for task, part in tasks.items()]
+            rows += [[f"  {task}", *cells(part.counted()), *difference(None)] for task, part in tasks.items()]
     note = f"as {first}, because they are as in training: {', '.join(equal)}" if equal else ""
     heads = ("condition", "success [%]", "episodes", *DIFFERENCE)
     return Table(heads, rows, "Success under other conditions, on the same seeds", note, ("p",))
 
 
-def _cells(found: Counted) -> list[str]:
+def cells(found: Counted) -> list[str]:
+    """Return a rate with its interval, and the episodes, as cells."""
     return [rate((found.rate, found.ci_low, found.ci_high)), f"{found.count}/{found.of}"]
 
 
@@ -78,7 +79,7 @@ def _secondary(name: str, found: Comparison) -> str:
 
 def rate_tables(report: Report) -> list[Table]:
     """Tabulate success by tier and task, instructions completed in a row, milestones and motion."""
-    rows = {kind: [[name, *_cells(each)] for name, each in rates.items()] for kind, rates in report.rates.items()}
+    rows = {kind: [[name, *cells(each)] for name, each in rates.items()] for kind, rates in report.rates.items()}
     if report.mean_over_tiers:
         rows["tiers"].append([report.mean_label, rate(report.mean_over_tiers), ""])
     mean = "; on average {:.2f} ({:.2f}-{:.2f})".format(*report.mean_in_a_row) if report.mean_in_a_row else ""

@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from urllib.parse import quote
 
-from vla.config.differences import ABSENT, at
-from vla.data.index import listed
+from vla.config.differences import at
+from vla.data.index import INDEX, listed, read_index
+from vla.io.errors import counted
 from vla.reports.factors import episode_panels
 from vla.reports.open_loop import errors_table
 from vla.reports.page import Section, render
 from vla.reports.pictures import GREEN, svgs
-from vla.reports.result_tables import conditions_table, rate_tables, secondary_table
+from vla.reports.result_tables import cells, conditions_table, rate_tables, secondary_table
 from vla.reports.tables import Table, config_value, duration, in_words, links, percent
 from vla.reports.training_curves import training_sections
 from vla.rollouts.recordings import pictured, shown
-from vla.rollouts.results import ERROR
-from vla.runs.folder import ERRORS_PLOT, PAGE, RECORDING, RECORDINGS, SAMPLES, Run, read_run
+from vla.rollouts.results import ERROR, Report, Result
+from vla.runs.folder import EPISODES, ERRORS_PLOT, PAGE, RECORDING, RECORDINGS, SAMPLES, Run, read_run
 from vla.spec import IN_DISTRIBUTION
 
-NAMED = 5  # maximum number of tasks in a title
+NAMED, LISTED = 5, 20  # maximum number of tasks in a title, and of recordings
 ROLLOUTS = "Failures first, of every outcome the first ones; each picture shows a whole episode in five seconds."
-EPISODES = (
+PLAYED = (
     "Outcomes, lengths, and, where only some succeed, success over the factors that it depends on most, with 95 % "
     "intervals; failures are red."
 )
+ROUNDS = "Rounds first play new episodes, with improve.changes, which the expert labels; validation has its own."
 WINDOWS = "The newest images of each window, its instruction, and each component of the action within its range."
 
 
@@ -41,8 +45,9 @@ def write_page(folder: Path) -> Path:
         Section("", facts=_facts(run)),
         *([errors_table(run.errors.components, len(run.errors.seeds))] if run.errors else []),
         Section("", picture=folder / ERRORS_PLOT if run.errors else None),
+        _rounds(run),
         _rollouts(run),
-        Section("Episodes", EPISODES, panels=svgs(episode_panels(report)) if report else {}),
+        Section("Episodes", PLAYED, panels=svgs(episode_panels(report)) if report else {}),
         *([conditions_table(run.reports, compared)] if others else []),
         secondary_table({(name,): found for name, found in compared.items()}),
         *(rate_tables(report) if report else ()),
@@ -65,19 +70,20 @@ def write_page(folder: Path) -> Path:
 
 
 def _tasks(run: Run) -> str:
-    """Return the names of the evaluated tasks, or how many there are; without any, the class of the goal or task."""
+    """Return the names of the evaluated tasks, or how many there are; without any, the goal's or task's class."""
     classes = (str(at(run.config, key, "")).rpartition(".")[2] for key in ("task.goal._target_", "task._target_"))
-    tasks = [in_words(task) for task in run.tasks] or [*filter(None, classes)][:1]
+    spaced = (re.sub(r"(?<=[a-z])(?=[A-Z])", " ", each).lower() for each in classes)
+    tasks = [in_words(task) for task in run.tasks] or [*filter(None, spaced)][:1]
     return ", ".join(tasks) if len(tasks) <= NAMED else f"{len(tasks)} tasks"
 
 
 def _ended(run: Run) -> str:
     """Return a sentence on how an incomplete training ended; "" if it was completed, or there was none."""
-    if not run.training or run.training.ended == "done":
+    if not (training := run.training) or training.ended == "done":
         return ""
-    if run.training.ended != "interrupted":
-        return f"Training failed: {run.training.ended}"
-    return f"Training was interrupted after {run.training.steps} steps; resume={_near(run.folder)} continues it."
+    if training.ended != "interrupted":
+        return f"Training failed: {training.ended}"
+    return f"Training was interrupted after {counted(training.steps, 'step')}; resume={_near(run.folder)} continues it."
 
 
 def _near(path: Path, *folders: Path) -> Path:
@@ -97,15 +103,33 @@ def _facts(run: Run) -> dict[str, str]:
     if report and report.latency_ms:
         facts["time per action"] = f"{report.latency_ms:.1f} ms"
     if training:
-        facts["training"] = f"{training.steps} steps in {duration(training.seconds)}"
-    if training and (demonstrations := at(run.config, "collect.episodes")) != ABSENT:
-        facts["demonstrations"] = str(demonstrations)
+        facts["training"] = f"{counted(training.steps, 'step')} in {duration(training.seconds)}"
+        asked = {"demonstrations": "collect.episodes", "and those in": "collect.more", "from weights of": "pretrained"}
+        known = {name: at(run.config, key, None) for name, key in asked.items()}
+        facts |= {name: config_value(value) for name, value in known.items() if value is not None}
     if report and report.seeds:
-        seeds = f"seeds {min(report.seeds)} to {max(report.seeds)}"
-        facts["evaluated on"] = seeds if run.report else f"the held-out episodes {listed(report.seeds)}"
+        seeds = counted(len(report.seeds), "seed" if run.report else "held-out episode")
+        facts["evaluated on"] = f"{seeds}: {listed(report.seeds)}"
     if report and report.checkpoint:
         facts["checkpoint"] = str(_near(Path(report.checkpoint), run.folder))
     return facts
+
+
+def _rounds(run: Run) -> Table:
+    """Tabulate the rounds with the expert that have a page, success before each, and the evaluation after them."""
+    rows = []
+    for page in sorted(run.folder.glob(f"round_*/{PAGE}"), key=lambda each: (len(each.parent.name), each)):
+        tried, _ = read_index(page.parent / EPISODES / INDEX, any_seed=False, damaged=False)
+        report = Report(tuple(Result(entry.seed, entry.outcome) for entry in tried if entry.stored))
+        name, trained = page.parent.name, read_run(page.parent)
+        link = links({in_words(name): f"{quote(name)}/{PAGE}"})
+        validated = percent(curve[1][-1]) if (curve := trained.metrics.get("val/success")) else ""
+        length = (str(trained.training.steps), duration(trained.training.seconds)) if trained.training else ("", "")
+        rows.append([link, *(cells(report.counted()) if report.results else ("", "")), validated, *length])
+    if rows and run.report:
+        rows.append(["evaluation", *cells(run.reports[IN_DISTRIBUTION].counted()), "", "", ""])
+    heads = ("round", "success before it [%]", "episodes", "in validation after it [%]", "steps", "training")
+    return Table(heads, rows, "Rounds with the expert", ROUNDS)
 
 
 def _rollouts(run: Run) -> Section:
@@ -115,14 +139,18 @@ def _rollouts(run: Run) -> Section:
     if (run.folder / RECORDING).is_file() and run.report:
         recorded = {*run.report.recorded}
         counts = [
-            f"{sum(each.seed in recorded for each in played)} of {len(played)} {name}"
-            for name, good in (("failures", False), ("successes", True))
+            f"{sum(each.seed in recorded for each in played)} of {counted(len(played), name)}"
+            for name, good in (("failure", False), ("success", True))
             if (played := [each for each in results if each.success == good])
         ]
         facts["recording"] = links({RECORDING: RECORDING}) + f" has {' and '.join(counts)}; rerun {RECORDING} plays it"
-        policy = f"checkpoint={_near(Path(run.report.checkpoint))} " if run.report.checkpoint else ""
-        command = f"python -m vla.run {policy}evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
-        facts["record another"] = command
+        policy = f"agent={at(run.config, 'chosen.agent')}"
+        policy = f"checkpoint={_near(Path(run.report.checkpoint))}" if run.report.checkpoint else policy
+        command = f"python -m vla.run {policy} evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
+        facts["record another"] = command if run.training else f"{command}, and the task's options of the command below"
+    if single := sorted(file.name for file in (run.folder / RECORDINGS).glob("*.rrd")):
+        more = f" and {len(single) - LISTED} more in {RECORDINGS}" if len(single) > LISTED else ""
+        facts["single recordings"] = links({name: f"{RECORDINGS}/{quote(name)}" for name in single[:LISTED]}) + more
     moving = shown(each for each in results if each.seed in pictures)
     return Section("Rollouts", ROLLOUTS, facts, rollouts=[(each, pictures[each.seed]) for each in moving])
 

@@ -17,7 +17,6 @@ DECADE = 10.0  # ratio of maximum to minimum above which a loss has a logarithmi
 PACE = "pace/"  # prefix of the metrics of the speed
 NOTE = "Against training steps; thin lines: training, thick lines: validation."
 
-
 Line = tuple[bool, str, Curve]  # whether it was logged in training, not in validation; colour; curve
 
 

@@ -17,7 +17,7 @@ from functools import partial
 
 from vla.data.episodes import EpisodeStore
 from vla.data.index import DAMAGED, NOT_NEEDED
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.progress import Bar
 from vla.parallel.pool import Cluster, Future, Pool, WorkersLost
 from vla.parallel.processes import WorkerFactory
@@ -98,7 +98,7 @@ def _fill_with(cluster: Cluster, make: WorkerFactory, store: EpisodeStore, fill:
         except WorkersLost as lost:
             if len(store.tried) == tried:
                 raise WorkersLost(f"{lost}; committed episodes are safe, run again to continue") from lost
-            log.warning("workers were lost after %d episodes; continuing with new ones", len(store.episodes))
+            log.warning("workers were lost after %s; continuing with new ones", counted(len(store.episodes), "episode"))
 
 
 class _Attempts:

@@ -58,7 +58,7 @@ class Comparison:
         if margin is None:
             more = (self.only_second or 0) > (self.only_first or 0)  # the median may be 0
             return replace(self, p_holm=p_holm, verdict="open" if not decided else "more" if more else "less")
-        points, bounded = f"{100 * margin:g} points", self.ci_low > -margin
+        points, bounded = f"{100 * margin:g} point{'' if margin == 0.01 else 's'}", self.ci_low > -margin
         if not decided:
             verdict = f"not worse by {points}" if bounded else "open"
         elif self.difference > 0:

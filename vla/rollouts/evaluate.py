@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.progress import Bar
 from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed, Future, Pool
 from vla.rollouts.motion import motion_of
@@ -134,7 +134,7 @@ class _Score:
         errors = self.outcomes[ERROR]
         completed = self.outcomes.total() - errors
         share = self.outcomes["success"] / completed if completed else 0.0
-        return f"success {100 * share:.0f} %" + (f", {errors} errors" if errors else "")
+        return f"success {100 * share:.0f} %" + (f", {counted(errors, 'error')}" if errors else "")
 
 
 def _results(future: Future, seeds: Sequence[int]) -> list[Result]:

@@ -16,7 +16,7 @@ import rerun_bindings
 import rerun_cli
 
 from vla.data.image_codec import encode
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.files import atomic_path
 from vla.io.types import Natural, Point
 from vla.rollouts.moving_picture import save_moving_picture
@@ -306,4 +306,4 @@ def merge(files: Sequence[Path], target: Path) -> None:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             reason = done.stderr[-500:].strip()
-            raise UserError(f"rerun could not merge {len(files)} recordings into {target}: {reason}")
+            raise UserError(f"rerun could not merge {counted(len(files), 'recording')} into {target}: {reason}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.rollouts.comparison import Together, compare_pairs, pairs_of
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.sequential import excludes, is_decided
@@ -66,7 +66,7 @@ class AgainstRun:
         verdict = found.conclude(found.p, self.margin).verdict
         difference, low, high = (f"{100 * share:+.1f}" for share in (found.difference, found.ci_low, found.ci_high))
         return (
-            f"compared with {self.run} on {found.episodes} common episodes: {verdict}, {difference} points "
+            f"compared with {self.run} on {counted(found.episodes, 'common episode')}: {verdict}, {difference} points "
             f"({low} to {high}), p = {found.p:.2g}"
         )
 

@@ -29,7 +29,7 @@ T = TypeVar("T")
 Curve = tuple[Array, Array]  # steps (N,) and values (N,)
 
 CONFIG, CHANGES, TRAINING = "config.yaml", "changes.yaml", "training.json"
-METRICS, REPORT = "metrics.csv", "report.json"
+METRICS, REPORT, EPISODES = "metrics.csv", "report.json", "episodes"  # the last: store of a round of job=improve
 PAGE, RECORDING = "report.html", "rollouts.rrd"
 RECORDINGS = "recordings"  # folder of moving pictures, and of single recordings until, or unless, they are merged
 SAMPLES, PLOT, SUITE = "samples.png", "report.png", "suite.png"

@@ -12,7 +12,7 @@ from typing import Any
 from vla.config.adopt import require_identity
 from vla.config.differences import differences
 from vla.data.index import INDEX
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.files import locked
 from vla.models.checkpoint import Header, read_header
 from vla.models.policy_folder import POLICY, read_policy
@@ -45,7 +45,7 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | N
     changed = any(trainer.get(name) != before.get(name) for name in LENGTHS)
     longer = changed and not 0 <= trainer["max_steps"] <= saved.steps
     if changed and not longer and trainer["max_steps"] != saved.steps:
-        log.warning("%s was trained for %d steps, more than trainer.max_steps", folder, saved.steps)
+        log.warning("%s was trained for %s, more than trainer.max_steps", folder, counted(saved.steps, "step"))
     if saved.finished and chosen.is_dir() and not longer:
         require_identity(read_policy(chosen).config, config, folder)  # which is what other jobs build
         log.info("training is already finished: %s", chosen)

@@ -20,7 +20,7 @@ from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning.pytorch.strategies import ModelParallelStrategy, Strategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.files import atomic_path
 from vla.models.checkpoint import read_content
 from vla.models.policy_writing import write_policy
@@ -97,7 +97,7 @@ class GracefulStop(Checkpoint):
             trainer.save_checkpoint(self._path, weights_only=False)
             trainer.should_stop = True
             trainer.limit_val_batches = 0  # else Lightning validates again before it stops
-            log.info("interrupted after %d steps, see %s", trainer.global_step, self._path)
+            log.info("interrupted after %s, see %s", counted(trainer.global_step, "step"), self._path)
         elif trainer.global_step % SAVE_EVERY == 0:
             trainer.save_checkpoint(self._path, weights_only=False)
 

@@ -16,7 +16,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.utilities.seed import isolate_rng
 from torch import Tensor
 
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.models.fsdp import local_shard
 from vla.models.learner import Learner
 from vla.training.device import memory_of, now, peak, reset_peak
@@ -109,7 +109,7 @@ class Estimate(Callback):
         batches = batches_left(trainer)
         scarce = self.memory > SCARCE * self._available
         advice = f"; if that is too much, {what_to_lower(self._config)}" if scarce else ""
-        whole = f"{batches * self.seconds / 60:.1f} minutes for {batches} batches" if batches >= 0 else "batches"
+        whole = f"{batches * self.seconds / 60:.1f} min for {counted(batches, 'batch')}" if batches >= 0 else "batches"
         log.info(
             "needs about %.2f of %.1f GB of memory, %.2f of which it has, and %s of %.0f ms, without validation%s",
             *(self.memory / GB, self._available / GB, self._held / GB, whole, 1000 * self.seconds, advice),

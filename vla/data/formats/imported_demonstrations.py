@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vla.data.episodes import EpisodeStore, observations_of
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.io.printable import track
 from vla.spec import Array, Episode, Spec
 
@@ -101,7 +101,7 @@ class ImportedDemonstrations(ABC):
         with store.writing():  # another process may have added some meanwhile
             first = store.next_seed or 0
             if (possible := len(store.episodes) + len(self) - first) < episodes:  # damaged ones are not imported again
-                raise UserError(f"only {possible} episodes are whole: set collect.episodes={possible}, or fewer")
+                raise UserError(f"only {counted(possible, 'whole episode')}: set collect.episodes={possible}, or fewer")
             missing = range(first, first + episodes - len(store.episodes))
             for number in track(missing, "importing"):
                 store.append(self.episode(number))
@@ -112,8 +112,8 @@ class ImportedDemonstrations(ABC):
 
     def require_enough(self, episodes: int) -> None:
         """Raise a UserError if there are fewer than `episodes` recorded episodes."""
-        if episodes > len(self):
-            raise UserError(f"there are only {len(self)} recorded episodes: set collect.episodes={len(self)}, or fewer")
+        if episodes > (there := len(self)):
+            raise UserError(f"only {counted(there, 'recorded episode')}: set collect.episodes={there}, or fewer")
 
     def require_held(self, store: EpisodeStore) -> None:
         """Raise a UserError unless the episodes that a store and this recording share are the same but for images."""

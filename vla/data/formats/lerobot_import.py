@@ -158,7 +158,7 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
                 log.info("images of %s are cropped at the centre and resized to task.image_size", camera)
         whole = len({part.episode for part in self._dataset.parts})
         if whole < len(self):
-            log.info("%d episodes become %d, one per instruction: the task changes within some", whole, len(self))
+            log.info("episodes: %d become %d, one per instruction: the task changes within some", whole, len(self))
         imported.log_clipped(self._actions, self.spec)
         return super().fill(store, episodes)
 

@@ -74,7 +74,7 @@ class Fast(ActionTokenizer):
         """
         if chunk != self.chunk:
             raise UserError(
-                f"the model predicts {chunk} actions, its tokenizer {self.chunk}: set tokenizer.chunk={chunk}"
+                f"the model has chunks of {chunk}, its tokenizer of {self.chunk}: set tokenizer.chunk={chunk}"
             )
         return chunk * self.components + 1
 
