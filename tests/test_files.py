@@ -43,7 +43,7 @@ def test_a_full_disk_leaves_what_was_there_and_is_named(tmp_path: Path, before: 
         draft.write_text("half")
         Path("/dev/full").write_text("the rest")
     assert str(failed.value).startswith(f"{target} cannot be written (No space left on device)")
-    assert ("the one before it is kept" in str(failed.value)) == bool(before)
+    assert ("and the earlier one is kept" in str(failed.value)) == bool(before)
     assert [path.read_text() for path in tmp_path.iterdir()] == [before] * bool(before)
 
 

@@ -101,7 +101,7 @@ def test_a_share_of_a_mixture_demands_to_leave_everything_in_place_and_the_rest_
     for goal, other in drawn:
         assert goal is other or (isinstance(goal, Stay) and goal.pads == other.pads)
     assert (mixed.absent, without.absent) == (1, 0)
-    with pytest.raises(ValueError, match=r"are 1\.1 in all, at most 1"):
+    with pytest.raises(ValueError, match=r"must be at most 1, not 1\.1"):
         Mixed(goals, 0.6, 0.5)
 
 

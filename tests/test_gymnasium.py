@@ -63,7 +63,7 @@ def test_the_spec_and_the_episodes_are_those_of_the_world_within() -> None:
             action = np.array([*np.clip(towards, -0.05, 0.05), random.uniform()], np.float32)
             seen, expected = world.step(action), own.step(action)
         assert own.outcome == ("success" if seed == 0 else "timeout")
-    with pytest.raises(ValueError, match="the episode is over"):
+    with pytest.raises(ValueError, match="no episode is running"):
         world.step(np.zeros(3, np.float32))
     with world.blind():
         assert world.reset(1).rgb == {}
@@ -138,7 +138,7 @@ def test_success_that_is_never_told_is_named_once(caplog: pytest.LogCaptureFixtu
         while not world.done:
             world.step(np.zeros(3, np.float32))
         assert world.outcome == "timeout"
-    assert caplog.text.count("the environment gave no info.sucess, task.success") == 1
+    assert caplog.text.count("a whole episode gave no info.sucess, so it counts as failed") == 1
 
 
 def test_what_the_command_line_names_is_trusted_and_what_a_file_names_is_not(

@@ -229,7 +229,7 @@ def test_a_seed_that_is_not_there_is_named(tmp_path: Path) -> None:
     assert find_episode(store, 2)[1].seed == 2
     with pytest.raises(ValueError, match="has no seed 7: it holds 0 to 4"):
         find_episode(store, 7)
-    with pytest.raises(ValueError, match=r"seed 3 in .* ended as timeout, .* not kept: there are 0, 1, 2, 4"):
+    with pytest.raises(ValueError, match=r"seed 3 in .* ended as timeout, .* not kept; seeds with steps: 0, 1, 2, 4"):
         find_episode(store, 3)
     change(tmp_path / "action.bin", lambda data: flip(data, 0))
     with pytest.raises(ValueError, match=r"the rows of seed 0 in .* were changed on disk"):

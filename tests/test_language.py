@@ -59,7 +59,9 @@ def test_other_words_replace_all_that_is_named_or_nothing_is_said() -> None:
     said = paraphrase("put the red block on the pad", words, ["red"])
     assert said == "put the crimson cube on the disc"
     for instruction in ("put the red cup on the pad, the red one", "lift the redder block"):
-        with pytest.raises(ValueError, match=r"task\.randomize\.phrasing\.words has no other words .* in '(put|lift) "):
+        with pytest.raises(
+            ValueError, match=r"task\.randomize\.phrasing\.words must replace everything .* in '(put|lift) "
+        ):
             paraphrase(instruction, {"the pad": "the disc"}, ["red"])
 
 

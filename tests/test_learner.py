@@ -191,7 +191,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path: Pat
         def __reduce__(self) -> str:
             raise OSError(28, "No space left on device")
 
-    with pytest.raises(OSError, match=r"last\.ckpt cannot be written \(.*\), the one before it is kept"):
+    with pytest.raises(OSError, match=r"last\.ckpt cannot be written \(.*\), and the earlier one is kept"):
         files.save_checkpoint({"step": 2, "more": Unwritable()}, tmp_path / "last.ckpt")
     assert torch.load(tmp_path / "last.ckpt", weights_only=True) == {"step": 1}
     assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]

@@ -91,7 +91,9 @@ def test_an_edited_dataset_is_not_taken_for_what_was_imported(home: Path, tmp_pa
     edited = changed(home, tmp_path / "edited")
     imported(edited, store)  # it is the same without checksums
     column(TASKS, "task", lambda table: pa.array([text.upper() for text in table["task"].to_pylist()]))(edited)
-    with pytest.raises(ValueError, match=r"episodes than these, such as 0: delete it .* another collect\.folder"):
+    with pytest.raises(
+        ValueError, match=r"differs from the recording, first in episode 0: delete it .* another collect\.folder"
+    ):
         imported(edited, store)
 
 
@@ -208,8 +210,12 @@ CELLS: dict[str, dict[str, Any]] = {
     r"no image but the path 'a{200}', which is no file": {"path": "a" * 5000},
     r"cannot be decoded: it is not PNG or JPEG or WEBP$": {"bytes": b"GIF89a"},
     r"cannot be decoded \(": {"bytes": png(Image.new("RGB", (16, 16)))[:45]},
-    r"the image is 300 x 400 pixels of RGB, not 16 x 16": {"bytes": png(Image.new("RGB", (400, 300)))},
-    r"16 x 16 pixels of I;16, not 16 x 16 of RGB, RGBA, L, LA, P": {"bytes": png(Image.new("I;16", (16, 16)))},
+    r"the image is 300 x 400 pixels of RGB, and must be 16 x 16, at most 16777216, of RGB": {
+        "bytes": png(Image.new("RGB", (400, 300)))
+    },
+    r"16 x 16 pixels of I;16, and must be 16 x 16, .* of RGB, RGBA, L, LA, P": {
+        "bytes": png(Image.new("I;16", (16, 16)))
+    },
 }
 
 
@@ -349,18 +355,21 @@ def test_images_of_cut_steps_stay_with_the_steps_that_are_left(home: Path, tmp_p
 @pytest.mark.parametrize(
     ("spec", "says"),
     [
-        (replace(ARM_SPEC, control_hz=20.0), r"a rate of 10 Hz, the task has 20 Hz"),
-        (replace(ARM_SPEC, cameras=("side", "top"), depth=()), r"no images of side and top, it has front, wrist"),
-        (OTHER, r"state of 15 numbers \(joint1, .*\), the task has 2 \(north, south\)"),
-        (replace(ARM_SPEC, action=("x", "z", "gripper")), r"action of 3 numbers \(x, y, .*has 3 \(x, z, gripper\)"),
+        (replace(ARM_SPEC, control_hz=20.0), r"its rate is 10 Hz \(expert\.every=1\), the task's 20 Hz"),
+        (
+            replace(ARM_SPEC, cameras=("side", "top"), depth=()),
+            r"no key for side and top, and there are images of front, wrist",
+        ),
+        (OTHER, r"state has 15 numbers \(joint1, .*\), that of the task 2 \(north, south\)"),
+        (replace(ARM_SPEC, action=("x", "z", "gripper")), r"action has 3 numbers \(x, y, .*task 3 \(x, z, gripper\)"),
         (
             replace(ARM_SPEC, high=(0.01, 0.01, 0.5)),
-            r"x in action from .* 0\.01 m, beyond which are \d+% \(other units, or absolute\?\); y .*; "
-            r"gripper .* has 0 to 0\.5, beyond which are \d+% \(other units",
+            r"action x is from .*, \d+% of it beyond the bounds of the task, .*0\.01 m \(other units, or abso.*; "
+            r"its action y .*; its action gripper .* of the task, 0 to 0\.5 \(other units",
         ),
         (
             replace(OTHER, control_hz=20.0, cameras=("side",), depth=(), action=("a", "b", "c")),
-            r"task: a rate .*; no images .*; state .*; action [^;]*$",  # all differences at once
+            r"task: its rate .*; .* no key for .*; its state .*; its action [^;]*$",  # all differences at once
         ),
     ],
     ids=["rate", "camera", "joints", "names", "units", "all"],
@@ -372,7 +381,7 @@ def test_differences_from_the_task_are_named(home: Path, spec: Spec, says: str) 
 
 def test_components_of_other_names_are_taken_in_their_order_if_asked(home: Path) -> None:
     spec = replace(ARM_SPEC, action=("east", "north", "grip"))
-    with pytest.raises(UserError, match=r"the task has 3 \(east, north, grip\): expert\.in_order=true takes them"):
+    with pytest.raises(UserError, match=r"that of the task 3 \(east, north, grip\): expert\.in_order=true takes them"):
         demonstrations(home / "dataset", spec)
     plain, renamed = demonstrations(home / "dataset", ARM_SPEC), demonstrations(home / "dataset", spec, in_order=True)
     np.testing.assert_array_equal(renamed.numbers(1)[2], plain.numbers(1)[2])
@@ -450,15 +459,18 @@ REFUSED: list[tuple[Change, str]] = [
     (told(fps=0), r"fps: Input should be greater than 0"),
     (told(features=feature("action", [3], [5])), r"no vector observation\.state, it has act"),
     (info(lambda info: info["features"]["action"].update(shape=[10**9])), "1000000000 components in action, the limit"),
-    (info(drop), r"it has none at all; action of 6 numbers \(action_0, .*, the task has 3 \(x, y, grip"),
+    (info(drop), r"no camera at all; its action has 6 numbers \(action_0, .*, that of the task 3 \(x, y, grip"),
     (lambda dataset: (dataset / INFO).write_text('{"features": ' + "[" * 100_000), r"json is damaged or of .*: copy"),
     (lambda dataset: (dataset / INFO).write_text('{"codebase_version": '), r"copy the dataset again"),
     (without_second, r"lists 2 of the 3 episodes that meta/info\.json counts: copy the dataset again .* or correct"),
     (told(total_frames=1000), r"lists \d+ of the 1000 frames that meta/info\.json counts: copy"),
-    (rows(lambda table: table.slice(0, len(table) - 1)), r"holds 10 of the 11 steps .* of episode 2: copy"),
+    (
+        rows(lambda table: table.slice(0, len(table) - 1)),
+        r"holds 10 steps of episode 2, and meta/episodes counts 11: copy",
+    ),
     (
         rows(lambda table: pa.concat_tables([table, table.slice(0, 1)])),
-        r"holds 13 of the 12 steps that meta/episodes counts of episode 0: correct",
+        r"holds 13 steps of episode 0, and meta/episodes counts 12: correct",
     ),
     (without(ROWS), r"data holds no tables: copy the dataset again"),
     (without(MP4), rf"lacks {MP4}: copy the dataset again"),
@@ -467,10 +479,10 @@ REFUSED: list[tuple[Change, str]] = [
     (listing, "cannot be read as a video"),
     (rows(lambda table: table.append_column("action", table["action"])), "the columns action, or has them twice"),
     *((pipe(name), f"{name} is a folder, a pipe or a device, not") for name in (INFO, TASKS, EPISODES, ROWS, MP4)),
-    (film(40, 64, 10), r"file-000\.mp4 has images of 64 x 64 pixels, not 16 x 16"),
+    (film(40, 64, 10), r"file-000\.mp4 is 64 x 64 pixels, meta/info\.json has 16 x 16"),
     (film(80, 16, 20), r"mp4 has 20 images per second, the dataset 10: encode the video again"),
-    (column(TASKS, "task", None), "none of them task with texts: correct"),
-    (column(TASKS, "task", "a" * 1001), "tasks of more than 1000 characters: 0"),
+    (column(TASKS, "task", None), "but no column task of texts: correct"),
+    (column(TASKS, "task", "a" * 1001), "shorten the tasks 0, of more than 1000 characters"),
     (column(ROWS, "task_index", 7), r"tasks\.parquet lacks task 7, which episode 0 has: correct the dataset"),
     (column(EPISODES, f"{VIDEO}chunk_index", "../../x"), COUNT),
     (column(EPISODES, "episode_index", 1.5), COUNT),
@@ -479,7 +491,10 @@ REFUSED: list[tuple[Change, str]] = [
     (column(ROWS, "action", "push"), NUMBERS),
     (column(ROWS, "action", [0.0, 0.0]), NO_NUMBERS),
     (column(ROWS, "episode_index", None), COUNT),
-    (column(ROWS, "action", not_finite), r"action is nan at index 1 in episode 1, step 3, the first of 2: correct"),
+    (
+        column(ROWS, "action", not_finite),
+        r"action is nan at index 1 in episode 1, step 3, the first of 2 such steps: correct",
+    ),
     (
         stamped(lambda times: times * 1.2),
         r"step 3 of episode 1 comes 0\.36 s after its first one, but at 10 Hz, .* 0\.3",

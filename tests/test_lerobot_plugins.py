@@ -84,7 +84,9 @@ def test_what_is_missing_or_of_another_shape_is_named() -> None:
     observation = ARM_SPEC.random_observation(np.random.default_rng(0))
     batch: dict[str, Any] = {key: value[None] for key, value in arrays(observation, ARM_SPEC).items()} | {"task": [""]}
     without = {key: value for key, value in batch.items() if key != lerobot.RATES}
-    with pytest.raises(ValueError, match=r"the policy needs observation\.velocities; there are observation\.images"):
+    with pytest.raises(
+        ValueError, match=r"the policy needs observation\.velocities, but the batch has observation\.images"
+    ):
         observations(without, ARM_SPEC)
     with pytest.raises(ValueError, match=r"observation\.state must be \(1, 8\): joint1, .*, gripper; it is \(1, 6\)"):
         observations({**batch, lerobot.STATE: batch[lerobot.STATE][:, :6]}, ARM_SPEC)

@@ -185,5 +185,5 @@ def test_a_dataset_of_something_else_ends_in_a_sentence(tmp_path: Path) -> None:
     folder = published(tmp_path / "libero", np.zeros((6, 7)), np.zeros((6, 7)), Image.new("RGB", (256, 256)))
     info(lambda content: content["features"]["observation.state"].update(shape=[7], names=None))(folder)
     config = Experiment.of(composed(*PLAIN, "expert=lerobot_libero", f"expert.folder={folder}"))
-    with closing(world()) as environment, pytest.raises(UserError, match=r"state of 7 numbers .* the task has 8"):
+    with closing(world()) as environment, pytest.raises(UserError, match=r"state has 7 numbers .* that of the task 8"):
         build(config["expert"], "expert", spec=environment.spec)

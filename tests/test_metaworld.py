@@ -316,7 +316,7 @@ def test_the_fast_renderer_draws_what_mujocos_does(parts: Parts) -> None:
     [
         ("task.tasks=[reach,fly]", "Meta-World has no task fly: it has assembly, basketball"),
         ("task.tasks=[reach] task.cameras=[corner2,wrist]", "task.cameras names wrist; Meta-World has topview, corner"),
-        ("task.tasks=[reach] task.window=[0.5,0,0.4,1]", "top above bottom, left of right"),
+        ("task.tasks=[reach] task.window=[0.5,0,0.4,1]", "with top < bottom and left < right"),
         ("task.image_size=[96,128]", r"task.image_size=\[96, 128\] would stretch what corner2 shows, which is square"),
         ("task.image_size=[96,128] task.cameras=[corner2,hand] task.window=[0,0,0.6,0.8]", "what hand shows, which"),
     ],

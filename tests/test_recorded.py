@@ -163,7 +163,7 @@ def test_another_recording_is_not_taken_for_the_stored_one(dataset: Path, tmp_pa
     assert not (tmp_path / "store").exists()  # which would block what is asked for next
     here(tmp_path, *import_it)
     column(ROWS, "action", lambda table: pa.array((np.array(table["action"].to_pylist(), "f4") + 1).tolist()))(copy)
-    assert "store holds other episodes than these" in here(tmp_path, *import_it, ok=False).stderr
+    assert "store differs from the recording, first in episode 0" in here(tmp_path, *import_it, ok=False).stderr
 
 
 def test_a_repaired_import_goes_on(dataset: Path, tmp_path: Path) -> None:
@@ -376,8 +376,8 @@ def test_joint_positions_in_degrees_move_a_robot_in_radians() -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"state_units": ("1",) * 3}, r"joint1\.pos \[1\], .* have no unit of a position, rad, deg, m: name it with"),
-        ({"units": ("1",) * 3}, r"joint1\.pos \[1\], .* have no unit of a position"),
+        ({"state_units": ("1",) * 3}, r"joint1\.pos \[1\], .* must have one of the units rad, deg, m: name it with"),
+        ({"units": ("1",) * 3}, r"joint1\.pos \[1\], .* must have one of the units"),
         (
             {"action": (*NAMES[:2], "x"), "robot": RobotModel(NAMES[:2], "")},
             r"action has x, which are no joints of its",
@@ -395,9 +395,7 @@ def test_a_recorded_world_says_what_contradicts_itself() -> None:
     made = {"cameras": ["a"], "image_size": [8, 8], "control_hz": 5.0, "units": "1", "joints": None}
     with pytest.raises(ValueError, match=r"low of x is 1\.0, not less than high, 0\.0"):
         Recorded(**made, state=["x"], action=["x"], low=[1.0], high=[0.0])  # type: ignore[arg-type]
-    with pytest.raises(
-        ValueError, match=r"task\.joints names x without a unit of a position, rad, deg, m: name it with"
-    ):
+    with pytest.raises(ValueError, match=r"task\.joints names x, whose unit must be one of rad, deg, m: name it with"):
         Recorded(**{**made, "joints": "all"}, state=["x"], action=["x"], low=[0.0], high=[1.0])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="robot names s, o, m, e, which is not in the state"):
         Recorded(**{**made, "joints": "some"}, state=["x"], action=["x"], low=[0.0], high=[1.0])  # type: ignore[arg-type]

@@ -249,7 +249,7 @@ WRONG: tuple[tuple[dict[str, Any], str], ...] = (
     ({"joints": [f"j{index}" for index in (0, 2, 1, 3, 4, 5)]}, r"task\.robot\.joints names j1 after .*: base to tip"),
     ({"tool": "tcp"}, r"task\.robot\.tool names tcp, which is no site or body"),
     ({"open": {"claw": 1.0}, "closed": {"claw": 0.0}}, r"task\.robot\.open names claw, which is no actuator or joint"),
-    ({"open": {"left": 0.04}}, r"task\.robot\.open names left, task\.robot\.closed left, right"),
+    ({"open": {"left": 0.04}}, r"open and closed must name the same, not \['left'\] and \['left', 'right'\]"),
     (
         {"fingertips": [["left_link"], ["thumb"]]},
         r"task\.robot\.fingertips names thumb, which is no geom, body or",

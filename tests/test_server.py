@@ -276,8 +276,8 @@ def test_scalars_of_numpy_are_numbers() -> None:
 WHOLE = message(observations(1)[0])
 WRONG: dict[str, tuple[Any, str]] = {
     "text": ("hello", "is a binary message in msgpack, not text"),
-    "noise": (b"\xc1\x00", "is no message in msgpack with arrays of numbers"),
-    "half": (pack(WHOLE)[:100], "is no message in msgpack"),
+    "noise": (b"\xc1\x00", "cannot be read as msgpack with arrays of numbers"),
+    "half": (pack(WHOLE)[:100], "cannot be read as msgpack"),
     "list": (pack([1, 2]), "an observation is a map, not list"),
     "empty": (pack({}), "lacks observation/image, observation/state, prompt: it has nothing"),
     "keys": (pack({"image": 1, "prompt": "go"}), "lacks observation/image, observation/state: it has image, prompt"),
@@ -304,7 +304,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         "has too many or too few bytes",
     ),
     "reset without a prompt": (pack({"reset": True, "seed": 7}), "prompt is an instruction"),
-    "deep": (b"\x91" * 100_000 + b"\x01", "is no message in msgpack"),
+    "deep": (b"\x91" * 100_000 + b"\x01", "cannot be read as msgpack"),
     "lists": (msgpack.packb([[0] * 1000] * (LONGEST_LIST // 1000)), "hold more than 10000 items"),
     "maps": (msgpack.packb([{}] * (LARGEST_MAP + 1)), "more than 1000 maps"),
 }

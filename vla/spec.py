@@ -109,8 +109,8 @@ class Spec:
         """Return the robot; if there is none, a UserError says that `what` needs one."""
         if self.robot is None:
             raise UserError(
-                f"{what} needs a robot, and the spec of this world has none (robot=None): a world gives one in its "
-                "spec, a recording by task.joints"
+                f"{what} needs a robot, and the spec of this world has none (robot=None): before training, name its "
+                "joints, in the spec of the world's class, or for a recording with task.joints"
             )
         return self.robot
 
@@ -159,7 +159,7 @@ class Spec:
         """Invert `to_dict` for untrusted values; if they are not a valid spec, a UserError calls them `name`."""
         spec = parse_plain(values, cls, name)
         if problem := next(_contradictions(spec), None):
-            raise UserError(f"{name} is damaged or of another kind: {problem}")
+            raise UserError(f"{name} is not valid: {problem}")
         return spec
 
     def require(self, other: Spec, what: str, against: str) -> None:
@@ -209,7 +209,7 @@ def _contradictions(spec: Spec) -> Iterator[str]:
             yield f"robot names {', '.join(unknown)}, which is not in the state"
         for name in ("velocities", "home"):
             if len(getattr(robot, name)) not in (0, joints):
-                yield f"robot has {joints} joints and {len(getattr(robot, name))} numbers in {name}"
+                yield f"robot has {joints} joints, but {len(getattr(robot, name))} entries in {name}"
         if robot.chain and [len(frame) for frame in robot.chain] != [7] * (joints + 1):
             yield f"chain is not 7 numbers for each of {joints} joints and the tool"
 

@@ -191,7 +191,7 @@ class WindowDataModule(LightningDataModule):
         if state["windows"] != self._digest:
             raise UserError(
                 f"the resumed training was started with other demonstrations than those in {self._folder}: "
-                "set collect.folder=DIR to their folder, or start a new training without resume="
+                "put the earlier ones back there, or start a new training in another output=DIR, without resume="
             )
 
     def train_dataloader(self) -> Prefetcher:

@@ -105,7 +105,7 @@ class EpisodeStore:
         wanted, stored = canonical(json.loads(dumps(config))), canonical(self.config)
         different = sorted(key for key in {*wanted, *stored} if wanted.get(key) != stored.get(key))
         if different:
-            raise UserError(f"{self.folder} was collected with another config for {different}: choose another folder")
+            raise UserError(f"{self.folder} has episodes of another {', '.join(different)}: set another collect.folder")
 
     def lacks(self, key: str, node: Any) -> bool:
         """Return whether the store is derived, and no part of it has `node` under `key` in its config."""
@@ -116,7 +116,7 @@ class EpisodeStore:
         """Raise a UserError if the images have other losses than those of `codec`; None accepts any."""
         if codec is not None and codec.loss != self.codec.loss:
             raise UserError(
-                f"{self.folder} holds {self.codec}, not {codec}: choose another folder, or omit collect.images"
+                f"{self.folder} holds {self.codec}, not {codec}: set another collect.folder, or omit collect.images"
             )
 
     def require_first_seed(self, seed: int) -> None:
@@ -238,7 +238,7 @@ class EpisodeStore:
             for path in paths:  # an unpacked archive may contain links, whose targets would be overwritten
                 require_file(path)
                 if path.is_symlink():
-                    raise UserError(f"{path} is a link, and nothing is added behind one: copy the file to this place")
+                    raise UserError(f"{path} is a link, and a store never writes through one: replace it by a copy")
                 self._files[path] = stack.enter_context(path.open("ab", buffering=0))
             stack.callback(self._files.clear)
             self._cut()

@@ -134,7 +134,7 @@ def write_header(folder: Path, spec: Spec, config: dict[str, Any], codec: Codec)
         return
     orphans = sorted(file.name for file in folder.iterdir() if file.suffix in (".bin", ".pack", ".jsonl"))
     if orphans:
-        raise UserError(f"{folder} holds {orphans[0]} without {NAME}, which says what it means: {REMEDY}")
+        raise UserError(f"{folder} holds {orphans[0]} without {NAME}, which describes it: {REMEDY}")
     content = asdict(Header(FORMAT, spec.to_dict(), config, _layouts(spec), codec))
     if codec == RAW:
         del content["codec"]

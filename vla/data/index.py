@@ -19,7 +19,7 @@ from vla.spec import LONGEST_INSTRUCTION, Name
 
 INDEX = "index.jsonl"  # in the folder of a store
 REMEDY = "copy the folder again from where it is whole, or delete it and collect again"
-SALVAGE = f"keep what is whole with job=inspect inspect.repair=true, {REMEDY}"
+SALVAGE = f"keep what is whole with job=inspect inspect.folder=DIR inspect.repair=true, {REMEDY}"
 DAMAGED = "damaged"  # outcome of a seed whose episode a repair could not save
 LOST = "lost"  # outcome of a seed whose index line is unreadable
 NOT_NEEDED = "not_needed"  # outcome of a seed that was skipped, because its task had its share of episodes
@@ -104,7 +104,7 @@ def parse_line(line: bytes, name: str) -> Entry:
         raise UserError(f"{name} is damaged: it does not fit its checksum")
     entry = parse_json(body, Entry, name)
     if entry.success and not entry.stored:
-        raise UserError(f"{name} is damaged: a success has steps")
+        raise UserError(f"{name} is damaged: it is a success without steps")
     return entry
 
 
@@ -148,7 +148,7 @@ def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], 
             problems[number] = str(error)
     remedy = REMEDY if any_seed or not entries else SALVAGE
     if damaged and remedy == SALVAGE:
-        return _with_lost(entries, len(lines)), 0
+        return _with_lost(path, entries, len(lines)), 0
     if problems:
         first, *others = problems
         more = f"; so are the lines {listed(others)}" if others else ""
@@ -169,14 +169,14 @@ def _lines(path: Path) -> list[bytes]:
     return [*lines, rest] if whole else lines
 
 
-def _with_lost(entries: dict[int, Entry], lines: int) -> list[Entry]:
+def _with_lost(path: Path, entries: dict[int, Entry], lines: int) -> list[Entry]:
     """Return the readable entries with a `LOST` one for every seed between, before and after them that has none."""
     first, last = min(entries), max(entries)  # numbers of lines
     oldest, newest = entries[first], entries[last]
     cut_off = int(first == 1 and oldest.start > 0)  # lines at the start: the first rows belong to a lost entry
     seeds = range(max(oldest.seed - first + 1 - cut_off, 0), newest.seed + lines - last + 1)
     if len(seeds) > 2 * lines:  # a damaged line end joins two lines, so there are at most two seeds to a line
-        raise UserError(f"the readable seeds, {oldest.seed} to {newest.seed}, are too far apart: {REMEDY}")
+        raise UserError(f"{path} has too few lines for its seeds, {oldest.seed} to {newest.seed}: {REMEDY}")
     known = {entry.seed: entry for entry in entries.values()}
     found, row = list[Entry](), 0
     for seed in seeds:

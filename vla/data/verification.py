@@ -97,7 +97,7 @@ def find_episode(store: EpisodeStore, seed: int) -> tuple[dict[str, Any], Episod
     if not stored:
         seeds, outcome = listed([entry.seed for entry in store.episodes]) or "none", tried[0][1].outcome
         raise UserError(
-            f"seed {seed} in {store.folder} ended as {outcome}, and its steps were not kept: there are {seeds}"
+            f"seed {seed} in {store.folder} ended as {outcome}, and its steps were not kept; seeds with steps: {seeds}"
         )
     if len(stored) > 1:
         count = f"{store.folder} has {len(stored)} episodes of seed {seed}"

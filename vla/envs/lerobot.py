@@ -92,7 +92,7 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
     keys = {name: IMAGE if name in (PICTURE, *single) else f"{IMAGES}{name}" for name in given}
     needed = [*keys.values(), *parts, TASK]
     if missing := [key for key in needed if key not in batch]:
-        raise UserError(f"the policy needs {', '.join(missing)}; there are {', '.join(map(str, batch))}")
+        raise UserError(f"the policy needs {', '.join(missing)}, but the batch has {', '.join(map(str, batch))}")
     count = len(batch[STATE])
     state = np.zeros((count, len(spec.state)), np.float32)
     for key, indices in parts.items():

@@ -44,7 +44,7 @@ def unpack(data: bytes) -> Any:
         return msgpack.unpackb(data, object_hook=budget.take_map, list_hook=budget.take_list, **bounds)
     except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as error:
         what = str(error)[:200] or type(error).__name__
-        raise UserError(f"this is no message in msgpack with arrays of numbers: {what}") from error
+        raise UserError(f"the message cannot be read as msgpack with arrays of numbers: {what}") from error
 
 
 class _Budget:

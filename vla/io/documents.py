@@ -132,7 +132,7 @@ def read_resolved(path: Path) -> Any:
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len(found := dict(pairs)) < len(pairs):
-            raise UserError("a key stands twice")
+            raise UserError("a mapping has one key twice")
         return found
 
     try:

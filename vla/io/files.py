@@ -96,7 +96,7 @@ def writing(target: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno not in UNWRITABLE:
             raise
-        kept = ", the one before it is kept" if target.is_file() else ""
+        kept = ", and the earlier one is kept" if target.is_file() else ""
         raise OSError(
             f"{target} cannot be written ({error.strerror}){kept}: make room there, or choose another folder"
         ) from error

@@ -75,8 +75,8 @@ def decode_image(content: bytes, size: tuple[int, int] | None = None) -> Array:
             height, width = image.height, image.width
             wanted = size or (height, width)
             if image.mode not in MODES or (height, width) != wanted or height * width > MOST_PIXELS:
-                asked = f", not {wanted[0]} x {wanted[1]} of {', '.join(MODES)}"
-                raise UserError(f"the image is {height} x {width} pixels of {image.mode}{asked}")
+                asked = f"{f'{size[0]} x {size[1]}, ' if size else ''}at most {MOST_PIXELS}, of {', '.join(MODES)}"
+                raise UserError(f"the image is {height} x {width} pixels of {image.mode}, and must be {asked}")
             return np.array(image.convert("RGB"))
     except UnidentifiedImageError as error:  # its text contains a memory address
         raise UserError(f"the image cannot be decoded: it is not {' or '.join(FORMATS)}") from error

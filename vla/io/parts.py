@@ -69,7 +69,7 @@ class Part:
         if unknown := [name for name in self.point if name not in state]:
             yield f"the part of {self.camera} moves with {', '.join(unknown)}, which is not in the state"
         if (len(self.point), len(self.offset), len(self.projection)) not in ((0, 0, 0), (3, 3, 12)):
-            yield f"the part of {self.camera} needs three names in point, and 3 and 12 numbers, or none of them"
+            yield f"the part of {self.camera} needs 3 names in point, 3 numbers in offset, 12 in projection, or none"
 
 
 def cut(picture: Array, window: Sequence[float] | Array, size: tuple[int, int]) -> Array:

@@ -62,9 +62,9 @@ def controller_for(
     found = list(zip(spec.action, spec.units, strict=True))
     expected = [*CartesianController.motion, (GRIPPER, "1")]
     if found != expected:
-        raise UserError(f"the policy's action is {_listed(found)}, expected {_listed(expected)}")
+        raise UserError(f"the policy's action is {_listed(found)}, expected {_listed(expected)}, or all joints")
     if workspace is None:
-        raise UserError("deploy.safety.workspace=null: Cartesian motion needs a box for the tool point")
+        raise UserError("Cartesian motion needs a box for the tool point: set deploy.safety.workspace to its corners")
     if ((arm.home < arm.lowest) | (arm.home > arm.highest)).any():
         raise UserError(
             "the home posture of the policy's arm is outside the limits of deploy.robot: is it another arm?"
@@ -97,8 +97,8 @@ def _joint_controller(spec: Spec, model: RobotModel, workspace: tuple[Point, Poi
     gripper = gripper_index(spec)
     if gripper is not None and (spec.low[gripper] < -SLACK or spec.high[gripper] > 1 + SLACK):
         raise UserError(
-            f"the action {GRIPPER} must be an opening, 0 closed to 1 open, and is from {spec.low[gripper]:g} to "
-            f"{spec.high[gripper]:g}: scale it before training"
+            f"the action {GRIPPER} must be an opening from 0, closed, to 1, open, and is from {spec.low[gripper]:g} to "
+            f"{spec.high[gripper]:g}: scale it before training, as expert.scale does for a dataset"
         )
     motion = [name for index, name in enumerate(spec.action) if index != gripper]
     units = dict(zip(spec.action, spec.units, strict=True))
@@ -125,7 +125,7 @@ def gripper_index(spec: Spec) -> int | None:
 def _factors(joints: Iterable[str], units: dict[str, str]) -> Array:
     if unknown := [(name, units[name]) for name in joints if units[name] not in UNITS]:
         raise UserError(
-            f"the joints {_listed(unknown)} have no unit of a position, {', '.join(UNITS)}: name it with task.units "
+            f"the joints {_listed(unknown)} must have one of the units {', '.join(UNITS)}: name it with task.units "
             "before training"
         )
     return np.array([UNITS[units[name]] for name in joints])

@@ -132,7 +132,7 @@ class Gymnasium(World):
         self._success_reported |= reported is not None
         if self.done and not self._success_reported:
             self._success_reported = True
-            log.warning("in a whole episode the environment gave no %s, task.success: that is a failure", self._success)
+            log.warning("a whole episode gave no %s, so it counts as failed: is task.success right?", self._success)
         return self._observe(values)
 
     def close(self) -> None:
@@ -201,7 +201,7 @@ def _get(values: Any, path: str, *default: Any) -> Any:
         if not isinstance(found, Mapping) or name not in found:
             if default:
                 return default[0]
-            there = ", ".join(map(str, found)) if isinstance(found, Mapping) else "no further names"
+            there = ", ".join(map(str, found)) if isinstance(found, Mapping) else "nothing further"
             raise UserError(f"there is no {path} in what the environment returns: instead of {name} there is {there}")
         found = found[name]
     return found

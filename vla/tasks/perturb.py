@@ -52,13 +52,13 @@ class Perturbation:
         """Check that the corners have one coordinate per component of `move`."""
         low, high, move = len(self.low), len(self.high), len(self.move)
         if not low == high == move:
-            raise UserError(f"expert.perturb has {low} numbers in low, {high} in high, {move} in move")
+            raise UserError(f"expert.perturb.low, high and move must be equally long, not {low}, {high} and {move}")
 
     def reset(self, spec: Spec, seed: int) -> None:
         """Draw the pace of an episode and its first excursion (UserError: the actions lack a named component)."""
         groups = self.move, (self.turn,) if self.turn else (), (self.gripper,) if self.gripper else ()
         if unknown := [name for group in groups for name in group if name not in spec.action]:
-            raise UserError(f"expert.perturb names {', '.join(unknown)}; actions have {', '.join(spec.action)}")
+            raise UserError(f"expert.perturb names {', '.join(unknown)}, but an action has {', '.join(spec.action)}")
         self._move, self._turn, self._grip = ([spec.action.index(name) for name in group] for group in groups)
         self._motions = [index for index in range(len(spec.action)) if index not in self._grip]
         self._shut, self._wide = (np.array(bounds)[self._grip] for bounds in (spec.low, spec.high))

@@ -60,8 +60,8 @@ class Recorded(SpecOnly):
         known = {**dict(zip(state, state_units, strict=True)), **dict(zip(action, action_units, strict=True))}
         if lacking := [name for name in joints or () if known.get(name, "rad") not in UNITS]:
             raise UserError(
-                f"task.joints names {', '.join(lacking)} without a unit of a position, {', '.join(UNITS)}: name "
-                "it with task.units, or leave the joint out"
+                f"task.joints names {', '.join(lacking)}, whose unit must be one of {', '.join(UNITS)}: name it with "
+                "task.units, or leave the joint out"
             )
         spec = Spec(
             cameras=tuple(cameras),

@@ -31,7 +31,7 @@ class World:
     def _require_running(self) -> None:
         """Raise a UserError if no episode has begun, or the last one is over."""
         if self.done:
-            raise UserError("the episode is over; call reset(seed) before step(action)")
+            raise UserError("no episode is running: call reset(seed) before step(action)")
 
     @contextmanager
     def blind(self) -> Iterator[None]:

@@ -54,9 +54,7 @@ class Files:
     def _is_exported(self, store: EpisodeStore, number: int) -> bool:
         folder = self._folder / f"episode_{number:05d}"
         if folder.exists() and read_json(folder / "manifest.json", dict[str, Any]) != self._manifest(store, number):
-            raise UserError(
-                f"{folder} was exported from another store, or as other files: choose another export.folder"
-            )
+            raise UserError(f"{folder} is not episode {number} of {store.folder}: choose another export.folder")
         return folder.exists()
 
     def _manifest(self, store: EpisodeStore, number: int) -> dict[str, Any]:

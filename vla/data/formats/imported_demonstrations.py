@@ -48,7 +48,7 @@ class ImportedDemonstrations(ABC):
     def recording(cls, **options: Any) -> Recording:
         """Describe the recording named by `options`, the arguments of the constructor without the spec (UserError: it
         is missing or damaged, or this format is for given tasks only)."""
-        raise UserError(f"{cls.__name__} does not describe its recordings: choose the task that they are of")
+        raise UserError(f"{cls.__name__} does not describe its recordings for task=recorded: choose their own task")
 
     @abstractmethod
     def __len__(self) -> int:
@@ -126,8 +126,8 @@ class ImportedDemonstrations(ABC):
             same = np.array_equal(states[entry.span], state) and np.array_equal(actions[entry.span], action)
             if entry.instruction != words or not same:
                 raise UserError(
-                    f"{store.folder} holds other episodes than these, such as {entry.seed}: delete it if it is an "
-                    "import of what they were before, or choose another collect.folder"
+                    f"{store.folder} differs from the recording, first in episode {entry.seed}: delete it if it was "
+                    "imported from an earlier version of that, or choose another collect.folder"
                 )
 
 
@@ -153,8 +153,8 @@ def out_of_bounds(actions: Array, spec: Spec, most: float) -> list[str]:
         if (beyond := ((values < low - slack) | (values > high + slack)).mean()) > most:
             unit = "" if spec.units[index] == "1" else f" {spec.units[index]}"
             found.append(
-                f"{name} in action from {values.min():.3g} to {values.max():.3g}, the task has {low:g} to {high:g}"
-                f"{unit}, beyond which are {beyond:.0%} (other units, or absolute?)"
+                f"its action {name} is from {values.min():.3g} to {values.max():.3g}, {beyond:.0%} of it beyond the "
+                f"bounds of the task, {low:g} to {high:g}{unit} (other units, or absolute?)"
             )
     return found
 

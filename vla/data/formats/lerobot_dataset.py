@@ -156,8 +156,8 @@ class LeRobotDataset:
             steps, number = order[start:end], row[OWNER]
             times = stamps[steps, 0]
             if len(steps) != (count := row[TO] - row[FROM]) or not count:
-                found, remedy = f"{self.folder}/data holds {len(steps)}", REMEDY if len(steps) < count else MEND
-                raise UserError(f"{found} of the {count} steps that meta/episodes counts of episode {number}: {remedy}")
+                found, remedy = f"{len(steps)} steps of episode {number}", REMEDY if len(steps) < count else MEND
+                raise UserError(f"{self.folder}/data holds {found}, and meta/episodes counts {count}: {remedy}")
             self._require_even(number, times - times[0])
             files = tuple(paths[each] for each in np.unique(file[steps]))
             # Actions after a change of the task do not follow the instruction before it.
@@ -275,7 +275,7 @@ class LeRobotDataset:
             step, steps = (owner[:row] == owner[row]).sum(), len(set(wrong[:, 0]))
             raise UserError(
                 f"{self.folder}: {name} is {values[row, at]} at index {at} in episode {owner[row]}, step {step}, the "
-                f"first of {steps}: correct the numbers, or delete the episodes with lerobot-edit-dataset"
+                f"first of {steps} such steps: correct the numbers, or delete the episodes with lerobot-edit-dataset"
             )
 
 
@@ -303,11 +303,11 @@ def _read_instructions(path: Path) -> dict[int, str]:
     texts = [field.name for field in schema if tables.is_text(field.type)]
     known = [name for name in (UNNAMED, "task") if name in texts] or (texts if len(texts) == 1 else [])
     if not known:
-        raise UserError(f"{path} has the columns {', '.join(schema.names)[:200]}, none of them task with texts: {MEND}")
+        raise UserError(f"{path} has the columns {', '.join(schema.names)[:200]}, but no column task of texts: {MEND}")
     table = tables.read([path], {TASK: COUNTS, known[0]: tables.TEXTS})
     tasks = dict(zip(table[TASK].to_pylist(), table[known[0]].to_pylist(), strict=True))
     if longer := [index for index, text in tasks.items() if len(text) > LONGEST_INSTRUCTION]:
-        raise UserError(f"{path} has tasks of more than {LONGEST_INSTRUCTION} characters: {listed(longer)}")
+        raise UserError(f"{path}: shorten the tasks {listed(longer)}, of more than {LONGEST_INSTRUCTION} characters")
     return tasks
 
 

@@ -69,7 +69,7 @@ class LeRobotExporter:
             if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):
                 raise UserError(f"{self._folder} has content other than these episodes: choose another export.folder")
             if store.codec.images == "jpeg":
-                log.warning("%s holds JPEG, of which videos lose more: export=files loses nothing", store.folder)
+                log.warning("videos lose more of the JPEG images in %s: export=files loses nothing", store.folder)
             draft = place / "dataset"
             if not _is_of(draft, source):
                 shutil.rmtree(draft, ignore_errors=True)

@@ -21,6 +21,7 @@ from vla.spec import Array
 
 CODEC = "libsvtav1"
 PIXELS = "yuv420p"  # the only layout that the encoder supports
+AGAIN = "copy the video again from where it is whole, or encode it again"
 
 
 def encode(path: Path, clips: Iterable[Array], size: tuple[int, int], fps: Fraction, crf: int) -> None:
@@ -83,7 +84,7 @@ def decode(
             if wanted >= count or number > wanted:
                 break
     if wanted < count:
-        raise UserError(f"{path} lacks the frame at {start + wanted / float(fps):.3f} s")
+        raise UserError(f"{path} lacks the frame at {start + wanted / float(fps):.3f} s: {AGAIN}")
 
 
 def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) -> None:
@@ -101,7 +102,7 @@ def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) 
             "that rate, or write its own as fps into meta/info.json"
         )
     if 0 < frames < count:  # 0: unknown
-        raise UserError(f"{path} has {frames} images of the {count} that the dataset needs")
+        raise UserError(f"{path} has {frames} images of the {count} that the dataset needs: {AGAIN}")
 
 
 @contextmanager
@@ -112,9 +113,9 @@ def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoS
         with av.open(path, format="mp4") as file:  # other formats may be playlists of files anywhere
             yield file, file.streams.video[0]
     except (av.error.FFmpegError, OSError, IndexError) as error:
-        raise UserError(f"{path} cannot be read as a video: {error}") from error
+        raise UserError(f"{path} cannot be read as a video ({error}): {AGAIN}") from error
 
 
 def _require_size(path: Path, images: av.VideoStream | av.VideoFrame, size: tuple[int, int]) -> None:
     if (images.height, images.width) != size:
-        raise UserError(f"{path} has images of {images.height} x {images.width} pixels, not {size[0]} x {size[1]}")
+        raise UserError(f"{path} is {images.height} x {images.width} pixels, meta/info.json has {size[0]} x {size[1]}")

@@ -166,19 +166,19 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         """Yield the differences between the spec and the metadata of the dataset."""
         dataset, spec = self._dataset, self.spec
         if abs(self._control_hz - spec.control_hz) > layout.RATE_TOLERANCE * spec.control_hz:
-            kept = f" and expert.every={self._every}" if self._every > 1 else ""
-            yield f"a rate of {self._control_hz * self._every:g} Hz{kept}, the task has {spec.control_hz:g} Hz"
+            yield f"its rate is {self._control_hz:g} Hz (expert.every={self._every}), the task's {spec.control_hz:g} Hz"
         if missing := [camera for camera in spec.cameras if camera not in dataset.images]:
-            yield f"no images of {' and '.join(missing)}, it has {_shortened(dataset.images) or 'none at all'}"
+            have = _shortened(dataset.images) or "no camera at all"
+            yield f"expert.images gives no key for {' and '.join(missing)}, and there are images of {have}"
         derived = spec.robot.velocities if spec.robot else ()
         for kind, places, ours in (
             ("state", self._state, [name for name in spec.state if name not in derived]),
             ("action", self._action, [*spec.action]),
         ):
             if any(name not in places for name in ours):
-                theirs = f"{kind} of {len(places)} numbers ({_shortened(places)})"
+                theirs = f"its {kind} has {len(places)} numbers ({_shortened(places)})"
                 in_order = ": expert.in_order=true takes them in their order" if len(places) == len(ours) else ""
-                yield f"{theirs}, the task has {len(ours)} ({_shortened(ours)}){in_order}"
+                yield f"{theirs}, that of the task {len(ours)} ({_shortened(ours)}){in_order}"
 
     def _states(self, rows: Array) -> Array:
         """Return the state in the rows of an episode, (N, P) float32; unknown velocities are differences."""

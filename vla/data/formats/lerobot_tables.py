@@ -78,7 +78,7 @@ def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -
     for path in paths:
         require(path, columns)
         if (unpacked := _unpacked_size(path, columns, only is not None)) > MAX_BYTES:
-            raise UserError(f"{path} unpacks to {unpacked / 1e9:.0f} GB, more than the {MAX_BYTES / 1e9:.0f} GB it may")
+            raise UserError(f"{path} unpacks to {unpacked / 1e9:.1f} GB, more than {MAX_BYTES / 1e9:.1f} GB: divide it")
         try:
             table = pq.read_table(path, columns=[*columns], filters=only, page_checksum_verification=True)
             table.validate(full=True)
@@ -89,7 +89,7 @@ def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -
     try:
         return pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
-        raise UserError(f"{paths[0]} and others beside it differ ({str(error)[:200]}): {MEND}") from error
+        raise UserError(f"{paths[0]} and files beside it have other types ({str(error)[:200]}): {MEND}") from error
 
 
 def _unpacked_size(path: Path, columns: Collection[str], filtered: bool) -> int:

@@ -82,7 +82,7 @@ def folders() -> dict[str, Path]:
         spec = find_spec(package)
         roots = spec.submodule_search_locations if spec else None
         if not roots:
-            raise UserError(f"task=libero does not find the folder of {package}: {INSTALL}")
+            raise UserError(f"task=libero does not find the folder of {package}: {INSTALL} --force-reinstall")
         places[prefix] = Path(next(iter(roots)), *parts)
     return places
 
@@ -137,4 +137,4 @@ def initial_states(task: Task) -> Array:
         with np.load(io.BytesIO(path.read_bytes())) as content:
             return content["states"]
     except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
-        raise UserError(f"the wheel lacks the initial states {path} of {task.name} ({error}): {INSTALL}") from error
+        raise UserError(f"{path} is missing or damaged ({error}): {INSTALL} --force-reinstall") from error

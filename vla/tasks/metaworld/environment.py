@@ -26,7 +26,7 @@ OBJECT, GOAL = slice(4, 7), slice(36, 39)
 
 
 def within(window: Sequence[float]) -> bool:
-    """top above bottom, left of right"""
+    """[top, left, bottom, right] with top < bottom and left < right"""
     top, left, bottom, right = window
     return top < bottom and left < right
 
@@ -84,7 +84,7 @@ class MetaWorld(ManyTasks):
             among = suggestion(unknown[0], known) or f": it has {', '.join(sorted(known))}"
             raise UserError(f"Meta-World has no task {', '.join(unknown)}{among}")
         if silent := [name for name in self.tasks if name not in sentences]:
-            raise UserError(f"task.sentences has none for {', '.join(silent)}")
+            raise UserError(f"task.sentences lacks {', '.join(silent)}: give every task an instruction")
         squares = [name for name in cameras if name != CAMERA or window is None]
         if squares and image_size[0] != image_size[1]:
             raise UserError(

@@ -52,7 +52,7 @@ class FileRobot(TabletopRobot):
         self._file, self._spec = file, file.read()
         spec, home = self._spec, robot_spec.checked_home(self._spec, file.joints, file.home)
         if file.open.keys() != file.closed.keys():
-            raise UserError(f"task.robot.open names {', '.join(file.open)}, task.robot.closed {', '.join(file.closed)}")
+            raise UserError(f"task.robot.open and closed must name the same, not {[*file.open]} and {[*file.closed]}")
         robot_spec.simplify(spec, file.joints, file.open)
         robot_spec.set_armature(spec, file.joints, ARMATURE)
         tool = robot_spec.add_tool(spec, file.tool, home, rotation_z(file.yaw), np.array(file.offset))

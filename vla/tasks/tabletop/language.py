@@ -41,7 +41,7 @@ class Grammar:
         if leaked:
             raise UserError(f"task.goal.language holds out what training also uses: {sorted(leaked)}")
         if not self.held_out_phrasings or not held_out:
-            raise UserError("the held-out part of task.goal.language is empty")
+            raise UserError("task.goal.language.held_out_phrasings and held_out_words must not be empty")
         if not any(f"{{{slot}}}" in phrasing for phrasing in self.phrasings for slot in held_out):
             raise UserError("task.goal.language.held_out_words has no slot of the phrasings, so it replaces no word")
         every = (*self.phrasings, *self.held_out_phrasings)

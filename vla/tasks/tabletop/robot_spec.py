@@ -192,7 +192,7 @@ def add_tool(
     turn = np.round(axes)
     if np.abs(axes).max(axis=0).min() < ALIGNED or abs(np.linalg.det(turn) - 1) > 0.1:
         raise UserError(
-            f"task.robot.home leaves the axes of {name} askew: one must point down and one forward, up to "
+            f"task.robot.home leaves the axes of {name} askew: one must point down and one forward, each within "
             f"{np.degrees(np.arccos(ALIGNED)):.0f} degrees; in its frame down is {np.round(axes[:, 2], 2).tolist()}, "
             f"forward {np.round(axes[:, 0], 2).tolist()}"
         )

@@ -223,8 +223,8 @@ class Simulation:
         substeps = round(seconds / self._timestep)
         if not math.isclose(substeps * self._timestep, seconds):
             raise UserError(
-                f"the arm cannot be driven at {1 / seconds:g} Hz, as physics runs at {1 / self._timestep:g} Hz: choose "
-                "a whole fraction of that"
+                f"the arm cannot be driven at {1 / seconds:g} Hz, as physics runs at {1 / self._timestep:g} Hz: set "
+                "joints_hz of the simulator to a whole fraction of that"
             )
         if self.disturber:
             joints, opening = self._disturbed(self.disturber, joints, opening, seconds)

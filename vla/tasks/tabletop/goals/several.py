@@ -33,7 +33,7 @@ class Mixed:
         """
         self.goals = _chosen(goals)
         if impossible + silent > 1:
-            raise UserError(f"task.goal.impossible and task.goal.silent are {impossible + silent:g} in all, at most 1")
+            raise UserError(f"task.goal.impossible + task.goal.silent must be at most 1, not {impossible + silent:g}")
         self.impossible, self.silent = impossible, silent
         self.blocks = max(goal.blocks for goal in self.goals.values())
         kept = [absent_colours_needed(goal.language) for goal in self.goals.values() if impossible]
@@ -68,10 +68,10 @@ class Chain:
         self.goals, self.length = _chosen(goals), length
         for name, goal in self.goals.items():
             if type(goal).after is Goal.after:
-                raise UserError(f"task.goal.goals.{name} cannot be part of a chain: it does not define `after`")
+                raise UserError(f"task.goal.goals.{name} cannot be part of a chain (no `after`): set it to null")
             if goal.language.held_out_colours:
                 raise UserError(
-                    f"task.goal.goals.{name}.language.held_out_colours: a chain names blocks of all colours"
+                    f"task.goal.goals.{name}.language.held_out_colours must be []: a chain names blocks of all colours"
                 )
         self.blocks = max(goal.blocks for goal in self.goals.values())
         self.pads = max(goal.pads for goal in self.goals.values())

@@ -34,7 +34,7 @@ class Distractors:
         """Draw the number; other axes draw for every block, so their draws do not depend on it."""
         low, high = self.count
         if high >= len(scene.block_geoms):
-            raise UserError(f"{high} distractors need task.blocks={high + 1}, it is {len(scene.block_geoms)}")
+            raise UserError(f"task.randomize.distractors.count={[low, high]} needs task.blocks={high + 1} or more")
         count = int(random_state.randint(low, high + 1))
         scene.present = count + 1
         return {"count": count}
@@ -51,7 +51,7 @@ class Colours:
         """Draw names and tints."""
         count = len(scene.block_geoms)
         if count > len(self.names):
-            raise UserError(f"{count} blocks need as many colours, but the colour axis has {list(self.names)}")
+            raise UserError(f"task.blocks={count} needs as many task.randomize.colour.names, not {len(self.names)}")
         names = [self.names[index] for index in random_state.permutation(len(self.names))[:count]]
         tint = random_state.uniform(-self.jitter, self.jitter, (count, 3))
         rgb = np.clip([COLOURS[name] for name in names] + tint, 0, 1)

@@ -67,7 +67,7 @@ def paraphrase(instruction: str, words: Mapping[str, str], names: Iterable[str])
     phrases = sorted(words, key=len, reverse=True)
     replaced = re.sub(rf"\b({'|'.join(map(re.escape, phrases))})\b", lambda found: words[found[0]], instruction)
     if replaced == instruction or set(names) & set(re.findall(r"\w+", replaced)):
-        raise UserError(f"task.randomize.phrasing.words has no other words for all that is named in {instruction!r}")
+        raise UserError(f"task.randomize.phrasing.words must replace everything that is named in {instruction!r}")
     return replaced
 
 
