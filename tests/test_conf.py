@@ -126,10 +126,10 @@ def test_a_variant_is_what_one_would_type(experiment: str, variant: str) -> None
     [
         (
             ("experiment=recipe", "variant=no_shft"),
-            "there is no variant=no_shft, did you mean no_shift? there are none",
+            "there is no variant=no_shft, did you mean no_shift? the variants are none",
         ),
-        (("variant=no_shift",), "there is no variant=no_shift; an experiment that is a grid has variants"),
-        (("experiment=recipe", "variant=chunked", "model.chunk=2"), "is model.chunk=4: omit model.chunk=2"),
+        (("variant=no_shift",), "there is no variant=no_shift: choose an experiment that has it"),
+        (("experiment=recipe", "variant=chunked", "model.chunk=2"), "sets model.chunk=4: omit model.chunk=2"),
         (("+variants.mine=3", "variant=mine"), "variants.mine must be a valid array"),
     ],
 )

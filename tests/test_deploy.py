@@ -232,7 +232,7 @@ def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monk
     [
         ("deploy.agent.topics.commands=/other", r"deploy\.agent\.topics and deploy\.simulator\.topics differ"),
         ("deploy.simulator.network.domain=7", r"deploy\.agent\.network and deploy\.simulator\.network differ"),
-        ("deploy.simulator.seed=999999", "seed=999999: seeds below 1000000 are those of demonstrations"),
+        ("deploy.simulator.seed=999999", "seed=999999: seeds below 1000000 are for demonstrations: raise it"),
     ],
 )
 def test_a_loop_that_would_report_something_else_is_refused(override: str, sentence: str, tmp_path: Path) -> None:

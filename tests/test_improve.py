@@ -113,7 +113,7 @@ def test_only_a_memoryless_expert_labels() -> None:
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [
-        ("improve.seed=999999", "reserved for evaluation"),
+        ("improve.seed=999999", "its rounds reach 1000000, where evaluation begins: lower it"),
         ("trainer.devices=2", "trains on one device"),
         ("expert=clean", "Waypoint cannot label the states of another agent"),
         ("evaluate.against=nowhere", "nowhere"),

@@ -286,7 +286,7 @@ def test_what_a_trusted_package_imports_is_not_trusted(importable: None) -> None
 @pytest.mark.parametrize("name", ["os", "builtins", "subprocess", "torch", "lightning", "numpy", "__main__"])
 def test_libraries_cannot_be_trusted(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(packages.TRUSTED, name)  # as if somebody had got past the first check
-    with pytest.raises(ValueError, match=r"^trust cannot name .*it takes packages made for vla"):
+    with pytest.raises(ValueError, match=r"^trust cannot name .*give the name by which a package is imported"):
         packages.trust([name], [])
     with pytest.raises(ValueError, match=r"^node must name a class of vla, of a package that trust=\[…\] names"):
         locate("node", f"{name}.Thing")

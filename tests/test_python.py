@@ -59,7 +59,9 @@ def test_the_policy_acts_in_the_world_as_it_was_evaluated(home: Path) -> None:
 def test_trust_is_an_argument_of_packages(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(packages.TRUSTED, "")
     for load in (load_policy, load_environment):
-        with pytest.raises(ValueError, match=r"^trust cannot name 'torch': it takes packages made for vla"):
+        with pytest.raises(
+            ValueError, match=r"^trust cannot name 'torch': give the name by which a package is imported"
+        ):
             load(home / CHECKPOINT, trust=["torch"])
         with pytest.raises(ValueError, match=r"^trust must be a list of packages"):
             load(home / CHECKPOINT, trust="documented")

@@ -196,7 +196,7 @@ def test_outliers_do_not_widen_the_bounds_and_rare_events_do() -> None:
     ("overrides", "says"),
     [
         (["expert.folder=nowhere"], "error: there is no LeRobot dataset in nowhere"),
-        (["task.action=[elbow]"], r"error: task.action names elbow, the recording has joint1.pos"),
+        (["task.action=[elbow]"], r"error: task.action names elbow: the recording has only joint1.pos"),
         (["task.units={elbow: rad}"], "error: task.units names elbow, the components are joint1.pos"),
         (["agent=remote", "agent.images.top=top"], "; +agent.images.top=VALUE adds it"),
         (["validate.episodes=3"], "validate.episodes=3: nothing can be played in a recording"),
@@ -249,7 +249,7 @@ def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset
     assert repeated["seeds"] == errors["seeds"] and repeated["components"] == errors["components"]
     assert "learner.lr" not in compared([tmp_path / "run", tmp_path / "again"], tmp_path).read_text()
     forgot = here(tmp_path, *again, "task=recorded", f"expert.folder={dataset}", ok=False)
-    assert "was trained with task.image_size=[24, 32], not [96, 128], and knows the episodes" in forgot.stderr
+    assert "was trained with task.image_size=[24, 32], not [96, 128], and only images of that size" in forgot.stderr
     (kept,) = tmp_path.glob("outputs/episodes/*")  # both found it, and the third imported nothing
     shutil.rmtree(kept)
     assert "name its folder with expert=lerobot expert.folder=DIR" in here(tmp_path, *again, ok=False).stderr

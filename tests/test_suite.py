@@ -50,7 +50,7 @@ def test_the_table_and_the_picture_show_every_condition(tmp_path: Path, figures:
     assert told.count("pick_place") == 0 and "as in training" not in told
     console.print(conditions_table({"seen": seen, "light_hard": hard, "mass_wide": seen}, {}))
     told = console.file.getvalue().removeprefix(told)  # type: ignore[attr-defined]
-    assert "as seen, because they are as in training: mass_wide" in told and told.count("20/20") == 1
+    assert "the same as seen, because they change nothing in the task: mass_wide" in told and told.count("20/20") == 1
     plot_conditions(reports, tmp_path / "suite.png")
     (axes,) = figures[0].axes
     assert points(axes) == [(1.0, 0.0), (0.5, 1.0), (0.75, 2.0)]

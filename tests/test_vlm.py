@@ -455,7 +455,7 @@ def test_a_published_policy_is_fine_tuned_and_evaluated_from_the_command_line(ho
     sizes = [f"model.network.{each}" for each in (*small, "keypoints=0")]
     tiny = [*SMALL, "model=smolvla_tiny", "model.text.name=tokenizer", "model.steps=2", "trainer.max_steps=2", *sizes]
     frozen = "learner.frozen=[network.vlm]"
-    random = f"{frozen}: what is random in there stays random"
+    random = f"{frozen}: what is not pretrained there stays random"
     assert random in here(home, *tiny, frozen, "job=train", "output=first", "hydra.run.dir=first").stdout
     to = ["export=lerobot_policy", "export.folder=published"]
     here(home, "job=export", "checkpoint=first", *to, "output=exported", "hydra.run.dir=exported")

@@ -65,7 +65,7 @@ def _described(error: Exception) -> str:
         if "No match in the defaults list" in text:  # such as task/goal of another task
             group = re.split(r"Could not \w+ '", text)[-1].partition("'")[0]
             adds = f"+{group}=OPTION adds it, if the chosen {group.rpartition('/')[0]} takes one"
-            return f"no option chosen has the group '{group}': {adds}; --help lists them"
+            return f"the chosen options have no group '{group}': {adds}; --help lists them"
         if text.endswith("appears more than once in the final defaults list"):  # of an option that is there twice
             return f"{text.partition(' ')[0]} comes from two options of one group: leave out the +, or name one of them"
         if text.startswith("Multiple values for "):
@@ -114,9 +114,9 @@ def _require_sweepable(experiment: Experiment, groups: Container[str]) -> None:
             raise UserError(f"experiment={name} is a grid of runs: add -m")
         return
     if not given.keys() >= params.keys():
-        raise UserError(f"experiment={name} is a grid of its own: name no other one beside it")
+        raise UserError(f"experiment={name} is a grid of its own: run it without other experiments")
     if "${" not in given.get("output", "${"):
-        raise UserError("with -m every cell has a folder of its own: name that of the sweep, hydra.sweep.dir=DIR")
+        raise UserError(f"output={given['output']} would be every cell's folder: name the sweep's, hydra.sweep.dir=DIR")
     slurm = config.runtime.choices["hydra/launcher"] == "submitit_slurm"
     if "trainer" in groups and not slurm and devices(experiment["trainer"]) > 1:
         # Processes that a trainer starts repeat the command line, here the whole sweep.
@@ -177,8 +177,8 @@ def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
         return finetune(cfg, overrides)
     if not jobs.find(cfg.job).adopts:
         raise UserError(
-            f"job={cfg.job} takes no checkpoint: resume=RUN continues a run, pretrained={cfg.checkpoint} starts a new "
-            "training from its weights"
+            f"job={cfg.job} takes no checkpoint: omit it, or train with resume=RUN, which continues a run, or "
+            f"pretrained={cfg.checkpoint}, which starts from its weights"
         )
     return adopt(cfg, overrides)
 

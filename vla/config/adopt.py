@@ -53,7 +53,7 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     values = _values(saved, REQUIRED_NODES)
     if cfg.job == "evaluate":
         if over := [each for each in parsed if _path(each).partition(".")[0] in OVER]:
-            text = "%s has no effect on the policy of checkpoint=, which is not trained; pretrained= trains it further"
+            text = "ignored: %s, because checkpoint= evaluates a policy as it is; pretrained= trains it further"
             log.warning(text, ", ".join(str(each.input_line) for each in over))
         parsed = [each for each in parsed if each not in over]  # a report shows the training as it was
         values |= _values(saved, REPORTED)
@@ -94,7 +94,7 @@ def _with_trunk(cfg: DictConfig) -> DictConfig:
     """
     if "trunk" not in cfg.model:
         raise UserError(
-            f"pretrained={cfg.pretrained} has weights of another project: say of which model, as in model=smolvla"
+            f"pretrained={cfg.pretrained} has weights of another project: choose their model, as in model=smolvla"
         )
     adopted = copy.deepcopy(cfg)
     adopted.model.trunk, adopted.pretrained = cfg.pretrained, None
@@ -114,8 +114,8 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     output = Path(cfg.output).resolve()
     if run.resolve().parent != output.parent and run.resolve() != output:
         raise UserError(
-            f"resume={run} is not among your runs in {output.parent}, and its config names files and folders: if it "
-            f"is yours, add output={run}; to use somebody else's weights: pretrained={run}"
+            f"resume={run} is not among your runs in {output.parent}, and a stranger's config could name any file: "
+            f"add output={run} if the run is yours, or train from its weights with pretrained={run}"
         )
     if cfg.job == "improve" != saved.get("job"):
         raise UserError(f"resume={run} is a training without rounds: job=improve pretrained={run} improves it")
@@ -141,7 +141,7 @@ def _saved(run: Path) -> tuple[Path, Mapping[str, Any]]:
     file = run / "config.yaml"
     if file.is_file() and (config := read_yaml(file, dict[str, Any])).get("job") == "improve":
         return file, resolved(config, str(file))
-    raise UserError(f"resume={run}: nothing was trained in that folder, there is no {run / LAST}")
+    raise UserError(f"resume={run} has no training to continue: there is no {run / LAST}")
 
 
 def _values(saved: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
@@ -215,7 +215,7 @@ def _on_top(cfg: DictConfig, saved: Mapping[str, Any], parsed: Sequence[Override
                 parent, _, name = path.rpartition(".")
                 node = OmegaConf.select(adopted, parent)
                 if not isinstance(node, DictConfig):
-                    raise UserError(f"{override.input_line} removes a key of {parent}, which the checkpoint lacks")
+                    raise UserError(f"{override.input_line} removes nothing, the saved config has no {parent}: omit it")
                 node.pop(name, None)
             elif _replaces(override):
                 OmegaConf.update(adopted, path, OmegaConf.select(cfg, path), merge=False, force_add=True)

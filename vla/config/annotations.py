@@ -82,7 +82,7 @@ def how_to_install(module: str) -> str:
     pattern = rf"{re.escape(module.partition('.')[0])}\b.*extra == '(\w+)'"
     # The last match counts, in alphabetical order: of the extras with transformers that is vlm, which suffices for all.
     *_, extra = ["", *(found[1] for each in requirements if (found := re.match(pattern, each)))]
-    return f"; install this package with its extra {extra}: pip install -e '.[{extra}]'" if extra else ""
+    return f"; install vla with its extra {extra}: pip install -e '.[{extra}]'" if extra else ""
 
 
 def require_trusted(source: object, target: Any, imported: bool = False) -> None:
@@ -212,7 +212,7 @@ def _required(predicate: Predicate) -> AfterValidator:
 
 def _plain(value: Any) -> Any:
     if is_node(value):
-        raise PydanticCustomError("plain", "no object")
+        raise PydanticCustomError("plain", "a plain value without a _target_")
     if isinstance(value, float) and not isfinite(value):
         raise PydanticCustomError("plain", "finite")
     for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():

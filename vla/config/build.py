@@ -217,8 +217,7 @@ def require_no_paths(
         if not any(f"{key}.".startswith(f"{name}.") for name in given or ()):
             hint = "" if given is None else f"; {key.rpartition('.')[0].replace('.', '/')}=OPTION gives yours"
             raise UserError(
-                f"{source} names a path or an address in {key}: these are taken from your own runs and commands only"
-                f"{hint}"
+                f"{source} names a path or an address in {key}: such values are taken from your command line only{hint}"
             )
 
 

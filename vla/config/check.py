@@ -90,9 +90,7 @@ def _check(experiment: Experiment, job: Job) -> None:
             require_chunking(method, kinds[1], config["model"].get("prefix", 0))
         model, begun = config["model"], settings.pretrained or settings.checkpoint
         if model.get("statistics") == "pretrained" and model.get("trunk", "") is None and not begun:
-            raise UserError(
-                "model.statistics=pretrained takes those of a published policy: add pretrained=…, or leave that out"
-            )
+            raise UserError("model.statistics=pretrained needs a published policy: add pretrained=… or omit the option")
     _check_contents(experiment, groups)
 
 
@@ -171,9 +169,9 @@ def _require_apart(validate: Validation, evaluate: Evaluation) -> None:
 def _require_together(tokenizer: type, model: type) -> None:
     taken = arguments(model).get("tokenizer")
     if taken is None:
-        raise UserError(f"{model.__name__} does not name its arguments: end them with **inherited: Inherited")
+        raise UserError(f"{model.__name__} needs the argument tokenizer: end its arguments with **inherited: Inherited")
     if taken.annotation not in (Any, Parameter.empty) and not fits(tokenizer, taken.annotation):
         raise UserError(
-            f"{model.__name__} predicts one token per component, which {tokenizer.__name__} does not have: choose "
-            "another tokenizer, such as uniform, or model=decoder, which goes with all"
+            f"{model.__name__} predicts one token per action component, and {tokenizer.__name__} does not make one per "
+            "component: choose another tokenizer, such as tokenizer=uniform, or model=decoder, which takes any"
         )

@@ -57,14 +57,14 @@ def with_variant(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
     if name is None:
         return config
     if name not in variants:
-        there = f"{suggestion(str(name), variants) or ':'} there are {', '.join(variants)}" if variants else ""
-        raise UserError(f"there is no variant={name}{there or '; an experiment that is a grid has variants'}")
+        there = f"{suggestion(str(name), variants) or ':'} the variants are {', '.join(variants)}" if variants else ""
+        raise UserError(f"there is no variant={name}{there or ': choose an experiment that has it'}")
     changes = plain(variants)[name]
     check_value(f"variants.{name}", changes, list[str])
     given = {override.partition("=")[0]: override for override in overrides}
     for change in changes:
         if contrary := given.get(change.partition("=")[0]):
-            raise UserError(f"variant={name} is {change}: omit {contrary}")
+            raise UserError(f"variant={name} sets {change}: omit {contrary}")
     return compose(*(override for key, override in given.items() if key != "variant"), *changes)
 
 

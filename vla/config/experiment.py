@@ -166,7 +166,7 @@ class Experiment:
         """Return the factory of the policy in a folder, by default `checkpoint`; raise a UserError if there is none."""
         checkpoint = checkpoint or self.checkpoint
         if checkpoint is None:
-            raise UserError("this needs a trained policy: checkpoint=RUN")
+            raise UserError("this job needs a trained policy: add checkpoint=RUN")
         return partial(make_policy, self.nodes["policy"], checkpoint, own=True)
 
     def make_recorder(self, folder: Path) -> Callable[[], Recorder] | None:
@@ -282,7 +282,7 @@ def make_agent(node: Node, group: str, environment: Environment) -> Agent:
     """Build the expert, or the agent, for an environment; raise a UserError if it is a recording, which cannot act."""
     agent: Agent = build(node, group, spec=environment.spec)
     if not hasattr(agent, "act"):
-        raise UserError("recorded demonstrations cannot act: this job needs the expert of a world that can be played")
+        raise UserError("recorded demonstrations cannot act: choose an expert that can, such as expert=waypoint")
     return agent
 
 

@@ -126,8 +126,8 @@ def is_trusted(target: Any) -> bool:
 def _require_trustworthy(key: str, name: Any) -> None:
     if not isinstance(name, str) or not can_be_trusted(name):
         raise UserError(
-            f"{key} cannot name {name!r}: it takes packages made for vla or gymnasium, whose distributions "
-            "depend on one of these, by the name that is imported, without a submodule"
+            f"{key} cannot name {name!r}: give the name by which a package is imported, without a submodule; the "
+            "package must depend on vla or gymnasium"
         )
 
 

@@ -49,7 +49,7 @@ def recorded(name: str, *, _root_: DictConfig) -> Any:
         return ListConfig(value) if isinstance(value, list) else value
     action = list(_root_.task.action)
     if unknown := [each for each in action if each not in found.bounds]:
-        raise UserError(f"task.action names {', '.join(unknown)}, the recording has {', '.join(found.bounds)}")
+        raise UserError(f"task.action names {', '.join(unknown)}: the recording has only {', '.join(found.bounds)}")
     return ListConfig([found.bounds[each][name == "high"] for each in action])
 
 

@@ -28,7 +28,7 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
     """
     wanted = experiment.collect
     if wanted.seed + wanted.episodes > FIRST_SEED:
-        raise UserError(f"collect.seed={wanted.seed}: seeds from {FIRST_SEED} on are reserved for evaluation")
+        raise UserError(f"collect.seed + collect.episodes must be at most {FIRST_SEED}: later seeds are for evaluation")
     store = complete_store(experiment)
     if store is None:
         store = _fill(experiment)

@@ -28,13 +28,13 @@ def run(experiment: Experiment) -> None:
     seed, episodes = (at(experiment["deploy"], key, None) for key in ("simulator.seed", "episodes"))
     if seed is not None and episodes is not None:  # whose success is reported
         if seed < FIRST_SEED:
-            raise UserError(f"deploy.simulator.seed={seed}: seeds below {FIRST_SEED} are those of demonstrations")
+            raise UserError(f"deploy.simulator.seed={seed}: seeds below {FIRST_SEED} are for demonstrations: raise it")
         if experiment.checkpoint is not None:
             require_unseen(experiment.checkpoint, "deploy.simulator.seed", range(seed, seed + episodes))
     policy, environment = partial(_policy, experiment), experiment.make_environment()
     deployment = experiment.build("deploy", policy=policy, environment=environment, output=experiment.output)
     if getattr(deployment, "needs_policy", True) and experiment.checkpoint is experiment.make_agent() is None:
-        raise UserError("this deployment needs a trained policy: checkpoint=RUN")
+        raise UserError("this deployment needs a trained policy: add checkpoint=RUN")
     if (report := deployment.run()) is not None:
         output = experiment.output
         write_report(report, output / REPORT, experiment.settings.checkpoint, experiment.config)
@@ -42,7 +42,7 @@ def run(experiment: Experiment) -> None:
         log.info("wrote %s", described([write_page(output), output / REPORT, output / PLOT]))
         print(printable(str(report)))
         if report.errors:
-            raise UserError(f"the episodes ended with an error, see {output / REPORT}: {report.errors[0].error}")
+            raise UserError(f"the last episode ended with an error, see {output / REPORT}: {report.errors[0].error}")
 
 
 def _policy(experiment: Experiment) -> Any:
@@ -53,5 +53,5 @@ def _policy(experiment: Experiment) -> Any:
     world: Any = experiment.world()
     agent: Any = make_agent(world)
     if not hasattr(agent, "plan"):
-        raise UserError(f"{type(agent).__name__} plans no chunks of actions, so it cannot be deployed")
+        raise UserError(f"{type(agent).__name__} plans no chunks of actions, which deploy= needs: use checkpoint=RUN")
     return agent

@@ -115,7 +115,8 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
                 facts = {**_facts(experiment, checkpoint), "weights": weights, "statements": said}
                 _write(experiment, checkpoint, reports, facts)
             if errors := _errors(reports):  # what was played is kept, so that the same command plays only these again
-                raise UserError(f"{counted(errors, 'episode')} ended in an error, see {output / REPORT}")
+                again = f"the same evaluation with output={output} plays only these again"
+                raise UserError(f"{counted(errors, 'episode')} ended in an error, see {output / REPORT}: {again}")
     finally:
         for line in conclusions:  # after whatever was logged, because scripts read the last line
             print(printable(line))
@@ -280,7 +281,7 @@ def _statements(experiment: Experiment) -> list[Statement]:
         )
     if not experiment.playable and (found or wanted.until or wanted.of_agents):
         raise UserError(
-            "evaluate.bar, against, until, without, nearest and networks need success, which recordings do not have: "
+            "evaluate.bar, against, until, without, nearest and networks need a success rate, which recordings lack: "
             "omit them"
         )
     return found

@@ -88,11 +88,11 @@ def _require_possible(experiment: Experiment) -> range:
     asked = experiment.options(Rounds)
     seeds = asked.seeds
     if seeds.stop > FIRST_SEED:
-        raise UserError(f"improve.seed={seeds.start}: seeds from {FIRST_SEED} on are reserved for evaluation")
+        raise UserError(f"improve.seed={seeds.start}: its rounds reach {FIRST_SEED}, where evaluation begins: lower it")
     if (Path(experiment.settings.output) / LAST).exists():
         raise UserError(f"{experiment.settings.output} has a training without rounds: choose another output=DIR")
     if devices(experiment["trainer"]) > 1:
-        raise UserError("job=improve trains on one device, because its trainings follow each other: trainer.devices=1")
+        raise UserError("job=improve trains on one device, as its trainings follow each other: add trainer.devices=1")
     if experiment.pretrained is not None:
         _require_further_episodes(experiment, experiment.pretrained)
     with closing(experiment.make_environment()()) as environment:

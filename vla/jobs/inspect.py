@@ -104,7 +104,7 @@ def replay_episode(
     if step is None:
         log.info("the replay goes through the same states, bit for bit, and ends in %s", episode.outcome)
     else:
-        log.warning("the replay differs from step %d on: the scene is the replay's, all else is from the store", step)
+        log.warning("the replay differs from step %d on: a recording shows its scene, all else is from the store", step)
     if written:
         recording = output / f"episode-{seed}.rrd"
         os.replace(output / written, recording)

@@ -83,8 +83,8 @@ def _held_out(experiment: Experiment, checkpoint: Path | None) -> float:
         size, asked = (at(config, "task.image_size") for config in (saved.config, experiment.config))
         if size != asked:
             raise UserError(
-                f"{checkpoint} was trained with task.image_size={str(size)[:50]}, not {asked}, and knows the episodes "
-                "that were held out by their images: set it as in training"
+                f"{checkpoint} was trained with task.image_size={str(size)[:50]}, not {asked}, and only images of that "
+                "size tell which episodes were held out: set it as in training"
             )
         fraction = at(saved.config, "data.validation_fraction", None)
     if not isinstance(fraction, float | int) or not fraction:
@@ -119,7 +119,7 @@ def _measure(experiment: Experiment, store: EpisodeStore, fraction: float, polic
     if not all(parts.values()):
         raise UserError(
             f"data.validation_fraction={fraction} holds {len(parts[True])} of the {len(store.episodes)} episodes in "
-            f"{store.folder} out of training, and there must be some of either kind: record more, or train with "
+            f"{store.folder} out of training, but some must be held out and some not: record more, or train with "
             "another fraction"
         )
     actions = store.rows("action")

@@ -69,7 +69,7 @@ def _shares(asked: Power, one: float, other: float) -> dict[str, float]:
         return {"": max(share, difference)}
     raise UserError(
         f"policies of {_percent(one)} and {_percent(other)} differ in {_percent(difference)} to {_percent(largest)} of "
-        f"the same episodes, not in {_percent(share)}: change plan.rates"
+        f"the same episodes, not in {_percent(share)}: change plan.rates or plan.discordant"
     )
 
 
@@ -79,7 +79,7 @@ def _measured(folders: tuple[str, str]) -> float:
     if common := common_episodes(one, other, IN_DISTRIBUTION):
         return sum(first.success != second.success for first, second in common) / len(common)
     raise UserError(
-        f"plan.runs={folders} have no episode in common: give the share of differing ones, plan.discordant=0.05"
+        f"plan.runs={folders} have no episode in common: replace them by plan.discordant=0.05, the share that differs"
     )
 
 

@@ -105,7 +105,7 @@ def warn_of_length(experiment: Experiment) -> None:
     steps, interval = trainer["max_steps"], trainer["val_check_interval"]
     if steps in (None, -1):
         if learner["schedule"] == "cosine":
-            text = "without trainer.max_steps learner.schedule=cosine has no end: the learning rate stays at its peak"
+            text = "without trainer.max_steps, learner.schedule=cosine has no end: the learning rate stays at its peak"
             log.warning(text)
         return
     if steps <= (warmup := learner.get("warmup_steps", 0)):  # a learner of a package may have no such key
@@ -128,7 +128,7 @@ def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_s
     if origin is last is None:
         experiment.fit_tokenizer(model.tokenizer, store)
         if random := [part for part in experiment["learner"]["frozen"] if not is_within(part, trunks(model))]:
-            log.warning("learner.frozen=[%s]: what is random in there stays random", ", ".join(random))
+            log.warning("learner.frozen=[%s]: what is not pretrained there stays random", ", ".join(random))
     if last is None:
         model.fit(store.numbers("state"), store.numbers("action"))
     _warn_of_tokenization(model, [store, *(each for each in more if each.episodes)])

@@ -153,7 +153,8 @@ class ProcessPool:
         try:
             return self._ask(item)
         except ProcessEnded as end:
-            raise Crashed(f"a worker process crashed twice: {end}; cluster.workers=1 shows the traceback") from end
+            way_out = "lower cluster.workers, or set PYTHONFAULTHANDLER=1 to see where"
+            raise Crashed(f"a worker process crashed twice: {end}; {way_out}") from end
 
     def _ask(self, item: Any) -> Any:
         process = self._process()

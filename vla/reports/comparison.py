@@ -116,8 +116,8 @@ def difference_tables(compared: Compared) -> list[Table]:
         counts = ["" if count is None else str(count) for count in (found.only_first, found.only_second)]
         rows.append([*case, str(found.episodes), *counts, *difference(found)])
     note = (
-        "On the episodes that both played, and in how many of these one succeeded alone; without such numbers, on "
-        "different episodes of the same world, or of several trainings."
+        "Rows with numbers of episodes in which only one succeeds compare the episodes that both played; other rows "
+        "compare different episodes of the same world, or several trainings."
     )
     heads = (*CASE, "episodes", *alone, *DIFFERENCE)
     return [Table(heads, rows, "Differences in success", note, (*alone, "p")), secondary_table(compared, CASE)]

@@ -21,12 +21,12 @@ from vla.rollouts.results import Result
 
 WILSON = "Wilson's; those of several trainings account for correlation within trainings and within scenes"
 EXACT = "of McNemar's exact test on episodes with the same seeds, and of Fisher's on others, with Newcombe's intervals"
-EARLY = "by betting, valid at any time, where playing stopped as soon as it was clear, and else"
+EARLY = "by betting, valid at any time, where playing stopped once the result was clear, and otherwise"
 RATES = "Rates have 95 % confidence intervals ({})."
 COMPARED = (
     "p is {}; p Holm is adjusted for all comparisons in the table, so that "
-    "at most 5 % of tables have a false difference. The verdict is a difference with p Holm of at most 0.05, not worse "
-    "if the interval, which is not adjusted, excludes a loss of that many percentage points, and open otherwise."
+    "at most 5 % of tables have a false difference. The verdict is better or worse if p Holm is at most 0.05, else not "
+    "worse by N points if the interval, which is not adjusted, excludes a loss of N percentage points, else open."
 )
 
 

@@ -41,7 +41,7 @@ def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Mappi
             rows.append([name, *cells(report.counted()), *difference(compared.get(name, {}).get(SUCCESS))])
             tasks = report.tasks if detailed and len(report.tasks) > 1 else {}
             rows += [[f"  {task}", *cells(part.counted()), *difference(None)] for task, part in tasks.items()]
-    note = f"as {first}, because they are as in training: {', '.join(equal)}" if equal else ""
+    note = f"the same as {first}, because they change nothing in the task: {', '.join(equal)}" if equal else ""
     heads = ("condition", "success [%]", "episodes", *DIFFERENCE)
     return Table(heads, rows, "Success under other conditions, on the same seeds", note, ("p",))
 

@@ -27,7 +27,7 @@ PLAYED = (
     "Outcomes, lengths, and, where only some succeed, success over the factors that it depends on most, with 95 % "
     "intervals; failures are red."
 )
-ROUNDS = "Rounds first play new episodes, with improve.changes, which the expert labels; validation has its own."
+ROUNDS = "Each round plays episodes with improve.changes and trains on the expert's labels; validation plays others."
 WINDOWS = "The newest images of each window, its instruction, and each component of the action within its range."
 
 

@@ -164,12 +164,12 @@ def metric_rows(path: Path) -> list[dict[str, str]]:
     try:
         names = next(rows, ["step"])
         if "step" not in names or len(set(names)) < len(names) or len(names) > MOST_METRICS:
-            raise UserError(f"there is no column step, one twice, or more than {MOST_METRICS}")
+            raise UserError(f"it has no column step, two of one name, or more than {MOST_METRICS} columns")
         for row in rows:
             if len(row) >= len(names):  # else truncated by a killed process
                 numbers = {name: value for name, value in zip(names, row, strict=True) if value}
                 if not 0 <= int(numbers.get("step", -1)) < 2**31 or not [*map(float, numbers.values())]:
-                    raise UserError(f"step is no count, but {numbers.get('step')}")
+                    raise UserError(f"step must be a number from 0 to {2**31 - 1}, got {numbers.get('step')}")
                 found.append(numbers)
     except (ValueError, csv.Error) as error:
         raise UserError(f"{path} is damaged in line {rows.line_num}: {str(error)[:200]}") from error

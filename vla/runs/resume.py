@@ -51,7 +51,7 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | N
         log.info("training is already finished: %s", chosen)
         return None, chosen
     if not last.exists():
-        raise UserError(f"{last} is gone, with which a longer training would continue: choose another output=DIR")
+        raise UserError(f"a longer training would continue from {last}, which is gone: choose another output=DIR")
     if isinstance(trainer.get("strategy"), dict) and not isinstance(before.get("strategy"), dict):
         # A sharded optimiser orders its parameters differently.
         raise UserError(f"trainer=fsdp cannot continue {last}, which was trained without it: use trainer=ddp")

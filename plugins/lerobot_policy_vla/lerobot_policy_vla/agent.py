@@ -62,5 +62,7 @@ def _require(config: PreTrainedConfig, spec: Spec, folder: str) -> None:
     given = arrays(spec.random_observation(np.random.default_rng(0)), spec)
     there = {key: (*value.shape,) for key, value in given.items()} | {ACTION: (len(spec.action),)}
     wanted = {key: (*part.shape,) for key, part in {**config.input_features, **config.output_features}.items()}
-    if other := [f"{key} {shape}, not {there.get(key)}" for key, shape in wanted.items() if shape != there.get(key)]:
+    if other := [
+        f"{key} {shape}, the task {there.get(key, 'none')}" for key, shape in wanted.items() if shape != there.get(key)
+    ]:
         raise UserError(f"the policy in {folder} does not fit the task: it has {'; '.join(other)}")

@@ -54,7 +54,9 @@ class VlaConfig(PreTrainedConfig):
         }
         self.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(spec.action),))}
         if self.scale and len(self.scale) != len(spec.action):
-            raise ValueError(f"--policy.scale has {len(self.scale)} factors, an action {', '.join(spec.action)}")
+            raise ValueError(
+                f"--policy.scale has {len(self.scale)} factors: give one for each of {', '.join(spec.action)}"
+            )
 
     @property
     def observation_delta_indices(self) -> None:

@@ -33,7 +33,7 @@ class VlaPolicy(PreTrainedPolicy):
     def __init__(self, config: VlaConfig, **_: Any) -> None:
         super().__init__(config)
         if not config.checkpoint:
-            raise ValueError("which policy? --policy.checkpoint=RUN")
+            raise ValueError("--policy.type=vla needs a policy: add --policy.checkpoint=RUN")
         device = "cuda" if str(config.device).startswith("cuda") else "cpu"
         options = {"device": device, "precision": config.precision, "compile": config.compile, "lanes": config.lanes}
         self._policy: Policy = make_policy(
