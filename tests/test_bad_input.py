@@ -19,7 +19,7 @@ BAD_INPUT = {
     "model=rt2": "model has no option 'rt2', did you mean rt1?",
     "trainer.max_steps=many": "trainer.max_steps must be ",
     "checkpoint=nowhere": "there is no policy 'nowhere': name a run",
-    "checkpoint=nowhere.ckpt": "only resumes its own training: a policy is a folder",
+    "checkpoint=nowhere.ckpt": "serves only to resume its own training: name the folder of the run",
     "job=deploy": "job=deploy needs deploy=OPTION",
     "job=report": "report.runs=[RUN,RUN]",
     "job=deploy deploy=loop": "this deployment needs a trained policy",

@@ -102,7 +102,7 @@ def test_an_arm_is_not_taken_over_where_it_was_long_ago() -> None:
     world = World()
     world.measures = False
     world.loop.on_joint_state(HOME + 0.1, np.zeros(7), 0.08, world.now - SAFETY.joints_age)
-    assert world.run(0.2) == [] and "joint state is older than" in world.loop.reason
+    assert world.run(0.2) == [] and "no joint state within" in world.loop.reason
     world.measures = True
     assert world.run(0.2)[0].position == pytest.approx(HOME)
 
@@ -188,7 +188,7 @@ def test_a_late_answer_still_ends_where_and_when_it_should(world: World) -> None
         (lambda world: setattr(world, "cameras", ["front"]), "camera wrist is older"),
         (lambda world: setattr(world, "cameras", []), "camera front is older"),
         (lambda world: setattr(world, "apart", 0.08), "images of front, wrist are more than 0.05 s apart"),
-        (lambda world: setattr(world, "measures", False), "joint state is older"),
+        (lambda world: setattr(world, "measures", False), "no joint state within"),
         (lambda world: setattr(world, "answer", lambda observation: None), "inference takes longer"),
     ],
     ids=["one camera", "no camera", "cameras out of step", "no joint states", "no answer"],
@@ -334,7 +334,7 @@ def test_an_arm_in_the_hands_of_a_person_is_not_commanded_and_goes_on_from_where
             lambda world: setattr(world, "joints", JOINT_HIGH - 0.01),
             r"panda_joint1 is at 2\.887 rad, outside -2\.847 to 2\.847: move it inside first",
         ),
-        (lambda world: setattr(world, "measures", False), "joint state is older"),
+        (lambda world: setattr(world, "measures", False), "no joint state within"),
         (lambda world: world.loop.on_joint_state(world.joints + 0.01, np.zeros(7), 0.08, world.now), "still moves"),
     ],
     ids=["outside", "unseen", "moving"],
@@ -548,7 +548,7 @@ OTHER: Any = {"action": ("x", "y"), "units": ("m", "m"), "low": (0, 0), "high": 
         ({"spec": replace(SPEC, robot=None)}, "deployment needs a robot, and the spec of this world has none"),
         ({"safety": replace(SAFETY, workspace=None)}, "needs a box for the tool point"),
         ({"command_hz": 5.0}, "command_hz"),
-        ({"limits": replace(ROBOT, **SHORTER)}, "trained with 7 joints, the robot has 6"),
+        ({"limits": replace(ROBOT, **SHORTER)}, "the policy has 7 joints, the robot 6"),
         (
             {"limits": replace(ROBOT, joints=[*ARM.joints[1::-1], *ARM.joints[2:]])},
             rf"has {ARM.joints[0]} where deploy\.robot\.joints has {ARM.joints[1]}: list .* order, {ARM.joints[0]}, ",

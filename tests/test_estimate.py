@@ -48,16 +48,16 @@ def test_it_is_said_before_and_compared_after(
         train(make_bc(), folder, tmp_path, killer=Estimate(SIZES), max_steps=4, accumulate_grad_batches=2)
     said, took = (each.getMessage() for each in caplog.records if each.name == estimate.__name__)
     numbers = re.match(
-        r"needs about ([\d.]+) of ([\d.]+) GB of memory, [\d.]+ of which it has, and [\d.]+ min for 8 batches of "
-        rf"(\d+) ms, without validation{advice}",
+        r"training needs about ([\d.]+) of ([\d.]+) GB of memory \(it holds [\d.]+\) and [\d.]+ min for 8 batches "
+        rf"of (\d+) ms, without validation{advice}",
         said,
     )
     assert numbers, said
     needed, there, milliseconds = map(float, numbers.groups())
     assert 0.1 < needed < there and milliseconds >= 1
-    assert re.match(rf"took [\d.]+ GB of memory and \d+ ms for a batch, after an estimate of {numbers[1]} GB", took), (
-        took
-    )
+    assert re.match(
+        rf"training took [\d.]+ GB of memory and \d+ ms for a batch, after an estimate of {numbers[1]} GB", took
+    ), took
 
 
 def test_what_the_memory_cannot_hold_is_refused_before_the_first_step(

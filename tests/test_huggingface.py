@@ -117,7 +117,9 @@ def test_a_state_names_the_encoder_and_no_other_one_takes_its_place(folder: Path
     other = transformers.BertModel(transformers.BertConfig(**sizes(), hidden_act="relu"))
     torch.nn.init.ones_(other.embeddings.word_embeddings.weight)
     other.save_pretrained(tmp_path / "moved")
-    with pytest.raises(UserError, match=r"moved is another text encoder than in training: .* begins with \w{8}, not"):
+    with pytest.raises(
+        UserError, match=r"moved is another text encoder than in training: .* SHA-256 \w{8}…, get those with"
+    ):
         HuggingFace(str(tmp_path / "moved"), width=8).load_state_dict(state)
 
 
@@ -174,7 +176,7 @@ def test_what_is_no_encoder_is_told_in_one_line(change: Callable[[Path], object]
 def test_without_folder_and_hub_the_name_is_named(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(UserError, match=f"{name} cannot be fetched .*; nor is it a folder here: give model.text"):
+    with pytest.raises(UserError, match=f"{name} cannot be fetched .*; nor is it a folder here: set model.text"):
         HuggingFace(name, width=8)
 
 

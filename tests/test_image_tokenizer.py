@@ -59,7 +59,7 @@ def test_features_can_tell_their_position() -> None:
 
 
 def test_film_conv_wants_lists_of_one_length() -> None:
-    with pytest.raises(ValueError, match="one entry per convolution"):
+    with pytest.raises(ValueError, match="kernels and strides must be equally many"):
         FilmConv([4, 6], [5], [2, 2], text_width=8, chroma=True, positions=False)
 
 

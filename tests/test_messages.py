@@ -48,7 +48,7 @@ def test_padded_rows_and_other_encodings_are_understood() -> None:
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
-        ({"data": b"abc"}, "3 by 2 pixels of rgb8 has 3 bytes in rows of 9"),
+        ({"data": b"abc"}, "3 bytes in rows of 9 are no 3 by 2 pixels of rgb8"),
         ({"step": 8}, "18 bytes in rows of 8"),
         ({"encoding": "x" * 10**6}, "encoding is 'x{79}…', expected"),
         ({"height": 0, "data": b""}, "3 by 0 pixels"),

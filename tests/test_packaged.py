@@ -37,7 +37,7 @@ def test_the_file_of_an_installed_package_is_found_by_its_hash(tmp_path: Path, m
     assert "some_weights" not in sys.modules
     path.write_bytes(b"changed")
     for source, sha256, message in (
-        (NAME, "0" * 64, f"some-weights 1.0 has no file with the SHA-256 {'0' * 64}: it is another version"),
+        (NAME, "0" * 64, f"some-weights 1.0 has no file with the SHA-256 {'0' * 64} of the configuration: install"),
         (NAME, digest(CONTENT), f"has the SHA-256 {digest(b'changed')}, not {digest(CONTENT)}: install"),
         ("no-such-weights", "0" * 64, "not installed here: pip install --no-deps no-such-weights"),
     ):

@@ -55,7 +55,7 @@ def test_a_policy_names_the_encoder_of_its_instructions(tmp_path: Path, tabletop
     assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(observation), action)
     assert (checkpoint / "model.safetensors").stat().st_size < 4 * sum(p.numel() for p in policy.model.parameters()) * 2
     folder.rename(tmp_path / "elsewhere")
-    with pytest.raises(UserError, match=r"encoder cannot be fetched .* of a policy in its config\.json"):
+    with pytest.raises(UserError, match=r"encoder cannot be fetched .* for a trained policy in its config\.json"):
         make_policy(CPU, checkpoint, tabletop)
     name = {"text": {"_target_": HUGGING_FACE, "_partial_": True, "name": str(tmp_path / "elsewhere")}}
     change_json(checkpoint / "config.json", lambda nodes: {**nodes, "model": nodes["model"] | name})

@@ -100,7 +100,7 @@ def test_what_is_no_policy_is_said_with_what_would_be_one(tmp_path: Path) -> Non
     for name, says in {
         "nowhere": "there is no policy '.*nowhere': name a run",
         "run": r"run is neither a policy nor a run with one, there is no .*run/policy/spec\.json$",
-        "run/checkpoints/last.ckpt": r"last\.ckpt only resumes its own training: a policy is a folder, .*run$",
+        "run/checkpoints/last.ckpt": r"last\.ckpt serves only to resume its own training: .*folder of the run, .*run$",
     }.items():
         with pytest.raises(ValueError, match=says):
             policy_folder(tmp_path / name)
@@ -109,7 +109,7 @@ def test_what_is_no_policy_is_said_with_what_would_be_one(tmp_path: Path) -> Non
         policy_folder(run)
     saved(run / "policy")
     assert policy_folder(run) == policy_folder(run / "policy") == run / "policy"
-    with pytest.raises(ValueError, match=rf"last\.ckpt only resumes .*, {run}$"):
+    with pytest.raises(ValueError, match=rf"last\.ckpt serves only to resume .*, {run}$"):
         policy_folder(run / "checkpoints/last.ckpt")
 
 
@@ -205,7 +205,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "a link to nothing": (link("training.json", "nothing"), r"has no training\.json"),
     "a list": (
         text("config.json", "[]"),
-        r"config\.json is of no policy of this project: it lacks task, tokenizer, mo",
+        r"config\.json is of no policy of this project: it needs task, tokenizer, mo",
     ),
     "no JSON": (text("config.json", "{"), r"config\.json is damaged or of another kind"),
     "a deep key twice": (text("training.json", '{"figures": {"a": 1, "a": 2}}'), "a mapping has one key twice"),

@@ -232,7 +232,7 @@ def test_joint_states_that_are_late_or_frozen_hold_the_arm(world: World, capfd: 
         behind = after
         world.live(0.8)
         assert world.state is State.HOLDING
-        assert world.statuses[-1].message.startswith("the newest joint state is older than 0.2 s")
+        assert world.statuses[-1].message.startswith("no joint state within the last 0.2 s")
         assert words in capfd.readouterr().err
 
 

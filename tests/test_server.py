@@ -196,9 +196,9 @@ def test_a_plan_goes_on_from_the_one_that_a_client_executes() -> None:
 @pytest.mark.parametrize(
     ("running", "sentence"),
     [
-        ([], r"running/actions is a plan \(n, 3\), not None"),
-        ({"actions": np.zeros((2, 2), np.float32), "delay": 0}, r"running/actions is a plan \(n, 3\)"),
-        ({"actions": np.zeros((0, 3), np.float32), "delay": 0}, r"\(n, 3\), not \(0, 3\)"),
+        ([], r"running/actions must be a plan \(n, 3\), got None"),
+        ({"actions": np.zeros((2, 2), np.float32), "delay": 0}, r"running/actions must be a plan \(n, 3\)"),
+        ({"actions": np.zeros((0, 3), np.float32), "delay": 0}, r"\(n, 3\), got \(0, 3\)"),
         ({"actions": np.full((2, 3), np.nan, np.float32), "delay": 0}, "running/actions holds a number that is not"),
         ({"actions": np.zeros((2, 3), np.float32), "delay": 3}, "running/delay is 3, expected an integer from 0 to 2"),
         ({"actions": np.zeros((2, 3), np.float32), "delay": True}, "running/delay is True"),
@@ -275,13 +275,16 @@ def test_scalars_of_numpy_are_numbers() -> None:
 
 WHOLE = message(observations(1)[0])
 WRONG: dict[str, tuple[Any, str]] = {
-    "text": ("hello", "is a binary message in msgpack, not text"),
+    "text": ("hello", "must be a binary message in msgpack, got text"),
     "noise": (b"\xc1\x00", "cannot be read as msgpack with arrays of numbers"),
     "half": (pack(WHOLE)[:100], "cannot be read as msgpack"),
-    "list": (pack([1, 2]), "an observation is a map, not list"),
+    "list": (pack([1, 2]), "an observation must be a map, got list"),
     "empty": (pack({}), "lacks observation/image, observation/state, prompt: it has nothing"),
     "keys": (pack({"image": 1, "prompt": "go"}), "lacks observation/image, observation/state: it has image, prompt"),
-    "image": (pack({**WHOLE, "observation/image": np.zeros((4, 4), np.uint8)}), r"is an image \(H, W, 3\).*\(4, 4\)"),
+    "image": (
+        pack({**WHOLE, "observation/image": np.zeros((4, 4), np.uint8)}),
+        r"must be an image \(H, W, 3\).*\(4, 4\)",
+    ),
     "range": (pack({**WHOLE, "observation/image": np.full((4, 4, 3), 255.0)}), "send uint8, or floats from 0 to 1"),
     "state": (pack({**WHOLE, "observation/state": np.zeros(3)}), "has 3 numbers, the policy needs 2: east, north"),
     "finite": (pack({**WHOLE, "observation/state": [np.nan, 0.0]}), "holds a number that is not finite"),
@@ -291,7 +294,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         pack({**WHOLE, "prompt": "a" * (LONGEST_INSTRUCTION + 1)}),
         "has 1001 characters, an instruction at most",
     ),
-    "prompts": (pack({**WHOLE, "prompt": ["go"]}), "prompt is an instruction, a text, not list"),
+    "prompts": (pack({**WHOLE, "prompt": ["go"]}), "prompt must be an instruction, a text, got list"),
     "seed": (pack({"reset": True, "seed": -1}), "seed is -1, expected an integer"),
     "half a seed": (pack({"reset": True, "prompt": "go", "seed": np.float32(0.5)}), "seed is 0.5, expected an integer"),
     "escapes": (pack({"\x1b]0;evil\x07\nerror: none": 1}), "the observation lacks"),
@@ -303,7 +306,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         msgpack.packb({b"__ndarray__": True, b"dtype": "<f8", b"data": b"", b"shape": [10**9, 10**9]}),
         "has too many or too few bytes",
     ),
-    "reset without a prompt": (pack({"reset": True, "seed": 7}), "prompt is an instruction"),
+    "reset without a prompt": (pack({"reset": True, "seed": 7}), "prompt must be an instruction"),
     "deep": (b"\x91" * 100_000 + b"\x01", "cannot be read as msgpack"),
     "lists": (msgpack.packb([[0] * 1000] * (LONGEST_LIST // 1000)), "hold more than 10000 items"),
     "maps": (msgpack.packb([{}] * (LARGEST_MAP + 1)), "more than 1000 maps"),
@@ -436,14 +439,16 @@ def test_a_server_with_other_components_or_another_rate_is_noticed(caplog: pytes
     slower = replace(SPEC, action=("y", "x", "gripper"), control_hz=7.0)
     with serving(policy) as url:
         threads = threading.active_count()
-        with pytest.raises(ValueError, match=r"its actions are x, y, gripper, ours are y, x, gripper: set agent\.act"):
+        with pytest.raises(
+            ValueError, match=r"its actions are x, y, gripper, the world's y, x, gripper: set agent\.act"
+        ):
             remote(url, spec=slower)
         assert threading.active_count() <= threads
         remote(url, spec=replace(SPEC, control_hz=7.0)).close()
         two = replace(SPEC, action=("x", "y"), low=SPEC.low[:2], high=SPEC.high[:2], units=SPEC.units[:2])
         fewer = remote(url, actions={"x": Component(0, 1.0, 0.0), "y": Component(1, 1.0, 0.0)}, spec=two)
         fewer.actions = None
-        with pytest.raises(ValueError, match=r"its actions have 3 components, ours are x, y: set agent\.actions"):
+        with pytest.raises(ValueError, match=r"its actions have 3 components, the world's x, y: set agent\.actions"):
             fewer.plan(observation)
         fewer.close()
         large = {name: Component(index, 100.0, 5.0) for index, name in enumerate(SPEC.action)}
@@ -451,7 +456,12 @@ def test_a_server_with_other_components_or_another_rate_is_noticed(caplog: pytes
         for _ in range(2):
             scaled.plan(observation)
         scaled.close()
-    assert caplog.text.count("are far beyond the bounds of the world, to which they are clipped: set agent.act") == 1
+    assert (
+        caplog.text.count(
+            "are far beyond the bounds of the world, to which they are clipped: convert their units with agent.act"
+        )
+        == 1
+    )
     assert f"acts at {SPEC.control_hz:g} Hz, the world at 7 Hz" in caplog.text
 
 
@@ -523,7 +533,7 @@ def test_an_address_is_reached_directly_whatever_proxy_the_environment_names(mon
     ],
 )
 def test_what_is_no_address_is_said_to_be_none(url: str, why: str) -> None:
-    with pytest.raises(ValueError, match=rf"^agent\.url=.* leads to no policy server \(.*{why}.*it looks like ws://"):
+    with pytest.raises(ValueError, match=rf"^agent\.url=.* leads to no policy server \(.*{why}.*give one like ws://"):
         remote(url)
 
 

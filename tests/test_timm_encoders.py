@@ -122,7 +122,7 @@ def test_weights_are_those_downloaded_before_or_random_with_a_warning(
     load_backbone("test_vit", False)
     assert not caplog.records
     source: Any = load_backbone("test_vit", "auto")
-    assert "starts at RANDOM: timm/test_vit.r160_in1k cannot be fetched" in caplog.text
+    assert "starts with RANDOM weights: timm/test_vit.r160_in1k cannot be fetched" in caplog.text
     folder = tmp_path / f"models--timm--{source.pretrained_cfg['architecture']}.{source.pretrained_cfg['tag']}"
     (folder / "snapshots/abc").mkdir(parents=True)
     (folder / "refs").mkdir()

@@ -70,7 +70,7 @@ def test_an_error_of_a_world_or_of_an_observation_ends_one_episode() -> None:
     policy = as_policy(make_rt1(), lanes=4)
     alone = {seed: rollout(ToyEnvironment(), policy, seed).executed for seed in (0, 3)}
     played = dict(play(worlds(4, Breaking), policy, range(4)))
-    assert isinstance(played[1], RuntimeError) and "the policy's state is" in str(played[2])
+    assert isinstance(played[1], RuntimeError) and "the state must hold" in str(played[2])
     for seed, executed in alone.items():
         np.testing.assert_array_equal(played[seed].executed, executed)
 

@@ -29,7 +29,7 @@ from vla.training import device, estimate
 device.time = estimate.time = SimpleNamespace(perf_counter=time.process_time)
 main()
 """
-SAID = r"about ([\d.]+) of [\d.]+ GB of memory, ([\d.]+) of which"
+SAID = r"about ([\d.]+) of [\d.]+ GB of memory \(it holds ([\d.]+)\)"
 TOOK = r"took ([\d.]+) GB of memory and (\d+) ms for a batch, after an estimate of [\d.]+ GB and (\d+) ms"
 
 

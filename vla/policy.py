@@ -267,12 +267,12 @@ class Policy:
         """
         spec = self.spec
         if observation.state.shape != (len(spec.state),):
-            raise UserError(f"the policy's state is {spec.state}, the observation's {observation.state.shape}")
+            raise UserError(f"the state must hold {', '.join(spec.state)}, but has the shape {observation.state.shape}")
         if wrong := [name for name, value in zip(spec.state, observation.state, strict=True) if not isfinite(value)]:
             raise UserError(f"the observation's state is not finite in {', '.join(wrong)}")
         rgb = spec.images(observation)
         if missing := [camera for camera in spec.cameras if camera not in rgb]:
-            raise UserError(f"the policy needs cameras {spec.cameras}, the observation lacks {', '.join(missing)}")
+            raise UserError(f"the observation lacks {', '.join(missing)}: the policy needs {', '.join(spec.cameras)}")
         for camera in spec.cameras:
             image = rgb[camera]
             if image.ndim != 3 or image.shape[2] != 3 or not image.size or image.dtype != np.uint8:

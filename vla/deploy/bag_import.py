@@ -174,7 +174,7 @@ class _Bag:
     def _instruct(self, at: float, message: Any) -> None:
         said = message.data.strip()
         if len(message.data) > LONGEST_INSTRUCTION:  # which the node drops
-            raise UserError(f"an instruction of {len(message.data)} characters")
+            raise UserError(f"an instruction of {len(message.data)} characters, the limit is {LONGEST_INSTRUCTION}")
         if not said and self._has_status:  # which stops the node, and its status tells until when
             return
         self._number += said != self._instruction or at - self._said_at > REPEATED
@@ -200,7 +200,7 @@ class _Bag:
 
     def _command_fingers(self, at: float, message: Any) -> None:
         if not len(message.data) or not np.isfinite(message.data).all():
-            raise UserError("finger positions that are not finite")
+            raise UserError("finger positions are missing or not finite")
         self.openings.append((at, np.mean(message.data) / self._limits.finger_travel))
 
 
@@ -225,9 +225,10 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         self.spec, self._limits = spec.without_truth, robot
         model = spec.require_robot("expert=bag")
         if len(robot.joints) != len(model.joints):
-            raise UserError(f"the task's robot has {len(model.joints)} joints, expert.robot has {len(robot.joints)}")
+            counts = f"the task's robot has {len(model.joints)} joints, expert.robot has {len(robot.joints)}"
+            raise UserError(f"{counts}: choose another one with deploy/robot@expert.robot=OPTION")
         if missing := [camera for camera in spec.cameras if camera not in topics.images]:
-            raise UserError(f"no topic for the cameras {', '.join(missing)}: add +expert.topics.images.{missing[0]}")
+            raise UserError(f"no topic for cameras {', '.join(missing)}: add +expert.topics.images.{missing[0]}=TOPIC")
         self._controller, self._gripper = recorded_controller(spec), gripper_index(spec)
         self._cameras = {topics.images[camera]: camera for camera in spec.cameras}  # topic → camera
         bags = _read_bags(folder, topics, robot)
@@ -361,7 +362,7 @@ def _segments(bags: Sequence[_Bag], cameras: Sequence[str]) -> list[tuple[_Bag, 
     found = []
     for bag, segment in ((each, segment) for each in bags for segment in each.segments()):
         if blind := [camera for camera in cameras if not bag.sees(camera, segment)]:
-            log.warning("%s: left out, because it has no image of %s: %s", bag.folder, ", ".join(blind), segment)
+            log.warning("%s: no image of %s in %s, which is left out", bag.folder, ", ".join(blind), segment)
         else:
             found.append((bag, segment))
     if found:

@@ -31,7 +31,7 @@ class Keys:
     def observation(self, message: Any, spec: Spec) -> Observation:
         """Convert a client's observation, with images of any size; raise a UserError if it does not match the spec."""
         if not isinstance(message, Mapping):
-            raise UserError(f"an observation is a map, not {type(message).__name__}")
+            raise UserError(f"an observation must be a map, got {type(message).__name__}")
         cameras = self.cameras(spec)
         wanted = [*cameras.values(), *self.state, self.prompt]
         found = {key: _find(message, key) for key in wanted}
@@ -65,10 +65,10 @@ def _image(key: str, value: Any) -> Array:
     """Return an image as (H, W, 3) uint8."""
     if not isinstance(value, np.ndarray) or value.ndim != 3 or 3 not in (value.shape[0], value.shape[2]):
         shape = getattr(value, "shape", type(value).__name__)
-        raise UserError(f"{key} is an image (H, W, 3) or (3, H, W), not {shape}")
+        raise UserError(f"{key} must be an image (H, W, 3) or (3, H, W), got {shape}")
     image = value if value.shape[2] == 3 else value.transpose(1, 2, 0)
     if not 1 <= min(image.shape[:2]) <= max(image.shape[:2]) <= LARGEST_IMAGE:
-        raise UserError(f"{key} has {image.shape[1]} by {image.shape[0]} pixels, at most {LARGEST_IMAGE} each")
+        raise UserError(f"{key} has {image.shape[1]} by {image.shape[0]} pixels, expected 1 to {LARGEST_IMAGE} each")
     if image.dtype == np.uint8:
         return np.ascontiguousarray(image)
     if image.dtype.kind != "f" or not (np.min(image) >= 0 and np.max(image) <= 1):  # NaN fails both
@@ -98,7 +98,7 @@ def _running(value: Any, spec: Spec) -> Running | None:
     said, width = value if isinstance(value, Mapping) else {}, len(spec.action)
     actions, delay = said.get("actions"), said.get("delay")
     if not isinstance(actions, np.ndarray) or actions.ndim != 2 or actions.shape[1] != width or not len(actions):
-        raise UserError(f"running/actions is a plan (n, {width}), not {getattr(actions, 'shape', None)}")
+        raise UserError(f"running/actions must be a plan (n, {width}), got {getattr(actions, 'shape', None)}")
     if type(delay) is not int or not 0 <= delay <= len(actions):
         raise UserError(f"running/delay is {repr(delay)[:50]}, expected an integer from 0 to {len(actions)}")
     return Running(_vector("running/actions", actions).reshape(actions.shape), delay)
@@ -107,7 +107,7 @@ def _running(value: Any, spec: Spec) -> Running | None:
 def instruction(key: str, value: Any) -> str:
     """Return an instruction; raises a UserError if it is none."""
     if not isinstance(value, str):
-        raise UserError(f"{key} is an instruction, a text, not {type(value).__name__}")
+        raise UserError(f"{key} must be an instruction, a text, got {type(value).__name__}")
     if len(value) > LONGEST_INSTRUCTION:
         raise UserError(f"{key} has {len(value)} characters, an instruction at most {LONGEST_INSTRUCTION}")
     return value

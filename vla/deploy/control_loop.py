@@ -60,7 +60,7 @@ class ControlLoop:
             UserError: the policy does not fit the arm or the command rate.
         """
         if command_hz < spec.control_hz:
-            raise UserError(f"command_hz is {command_hz}, below the {spec.control_hz} actions/s of the policy")
+            raise UserError(f"deploy.command_hz={command_hz} must be at least the policy's {spec.control_hz} actions/s")
         self.goals = Goals(spec, limits, safety.workspace)
         self.spec, self.limits, self.safety, self.tick = spec, limits, safety, 1 / command_hz
         self._follows_positions, self._execute = follows_positions, execute
@@ -288,7 +288,7 @@ class ControlLoop:
         """Say that the newest joint state is too old, or that there is none; empty if it is recent."""
         newest = self._observer.newest
         recent = newest is not None and now - newest.at <= self.safety.joints_age
-        return "" if recent else f"the newest joint state is older than {self.safety.joints_age} s"
+        return "" if recent else f"no joint state within the last {self.safety.joints_age} s"
 
     def _set_state(self, state: State, reason: str) -> None:
         if state is not self.state:

@@ -73,7 +73,7 @@ def image_from(message: Any) -> Array:
     height, width, step = message.height, message.width, message.step
     if not height or not width or step < width * depth or len(message.data) != step * height:
         raise UserError(
-            f"image of {width} by {height} pixels of {message.encoding} has {len(message.data)} bytes in rows of {step}"
+            f"{len(message.data)} bytes in rows of {step} are no {width} by {height} pixels of {message.encoding}"
         )
     rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, : width * depth]
     return np.ascontiguousarray(rows.reshape(height, width, depth)[..., order])

@@ -79,7 +79,7 @@ class Goals:
         model = spec.require_robot("deployment")
         if len(limits.joints) != len(model.joints):
             raise UserError(
-                f"the policy was trained with {len(model.joints)} joints, the robot has {len(limits.joints)}"
+                f"the policy has {len(model.joints)} joints, the robot {len(limits.joints)}: use another deploy/robot"
             )
         for ours, theirs in zip(model.joints, limits.joints, strict=True):
             if ours != theirs and ours in limits.joints:

@@ -154,7 +154,7 @@ def open_onnx(path: Path) -> Run:
     try:
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # of its own kinds
-        raise UserError(f"{path} is damaged: delete its folder, and export the policy again") from error
+        raise UserError(f"{path} is damaged: delete its folder, and the policy is exported again") from error
     used = {node.name for node in session.get_inputs()}  # without inputs that the program ignores
 
     def run(inputs: Inputs) -> Tensor:

@@ -47,7 +47,7 @@ class PolicyNode(GuardedLifecycleNode):
         settings, topics, spec = self.settings, self.settings.topics, self.policy.spec
         if unnamed := sorted(set(spec.cameras) - set(topics.images)):
             missing = ", ".join(unnamed)
-            raise UserError(f"no topic for the policy's cameras {missing}: add +deploy.topics.images.{unnamed[0]}")
+            raise UserError(f"no topic for cameras {missing}: add +deploy.topics.images.{unnamed[0]}=TOPIC")
         execute = executed(self.policy) if getattr(self.policy, "chunking", None) else None
         follows = not settings.dry_run
         loop = ControlLoop(spec, settings.robot, settings.safety, settings.command_hz, follows, execute)

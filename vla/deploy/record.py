@@ -62,7 +62,7 @@ class BagRecorder:
                 continue
             self._known.add(topic)
             if kind not in message_types().fielddefs:  # of another ROS distribution, or a custom type
-                self._node.get_logger().warning(f"{shorten(topic)} is not recorded: its type is {shorten(kind)}")
+                self._node.get_logger().warning(f"{shorten(topic)} is not recorded: unknown type {shorten(kind)}")
                 continue
             offered = [info.qos_profile.durability for info in self._node.get_publishers_info_by_topic(topic)]
             qos = latched if {*offered} == {latched.durability} else best_effort
@@ -80,8 +80,8 @@ class BagRecorder:
 def main() -> None:
     """Record."""
     parser = argparse.ArgumentParser(prog="python -m vla.deploy.record", description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--network", choices=NETWORKS, default="loopback")
+    parser.add_argument("folder", type=Path, help="folder of the bag, which must not exist")
+    parser.add_argument("--network", choices=NETWORKS, default="loopback", help="deploy.network.reach of the agent")
     options = parser.parse_args()
     with command_node("vla_record", options.network) as (node, stopped):
         with closing(BagRecorder(node, options.folder)) as recorder:

@@ -23,11 +23,11 @@ FLAGS = {  # in the order in which they are obeyed; the instruction follows --ha
 def main() -> None:
     """Do what is asked."""
     parser = argparse.ArgumentParser(prog="python -m vla.deploy.say", description=__doc__)
-    parser.add_argument("instruction", nargs="?")
-    parser.add_argument("--topic", default="/user/command")
+    parser.add_argument("instruction", nargs="?", help="sentence to follow; an empty one stops the agent")
+    parser.add_argument("--topic", default="/user/command", help="deploy.topics.instruction of the agent")
     for flag, purpose in FLAGS.items():
         parser.add_argument(f"--{flag}", action="store_true", help=purpose)
-    parser.add_argument("--network", choices=NETWORKS, default="loopback")
+    parser.add_argument("--network", choices=NETWORKS, default="loopback", help="deploy.network.reach of the agent")
     options = parser.parse_args()
     if options.instruction is None and not any(getattr(options, flag.replace("-", "_")) for flag in FLAGS):
         parser.error(f"nothing to do: add an instruction, or one of --{', --'.join(FLAGS)}")

@@ -194,7 +194,7 @@ class Service:
 
     async def _answer(self, lane: int, data: str | bytes) -> dict[str, Any]:
         if isinstance(data, str):
-            raise UserError("an observation is a binary message in msgpack, not text")
+            raise UserError("an observation must be a binary message in msgpack, got text")
         message = unpack(data)
         if isinstance(message, Mapping) and message.get("reset") is True:
             seed = message.get("seed", lane)

@@ -40,7 +40,7 @@ class SimulatorNode(Node):
         self._model = environment.spec.require_robot("deploy=simulator")
         if not isinstance(environment, TakesJointTargets):
             raise UserError(
-                f"deploy=simulator needs an environment that is TakesJointTargets, {type(environment).__name__} is not"
+                f"deploy=simulator needs TakesJointTargets, such as task=tabletop: {type(environment).__name__} is none"
             )
         control_hz = environment.spec.control_hz
         self._ticks_per_step = round(rates[0] / control_hz)

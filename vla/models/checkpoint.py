@@ -47,7 +47,7 @@ def read_content(path: Path, weights: bool = True) -> dict[str, Any]:
     except OSError:
         raise
     except Exception as error:  # a damaged pickle can raise nearly anything
-        raise UserError(f"{path} cannot be read as a checkpoint, it is damaged or something else") from error
+        raise UserError(f"{path} cannot be read as a checkpoint: it is damaged or of another kind") from error
     return content if isinstance(content, dict) else {}
 
 

@@ -105,10 +105,10 @@ def require_chunking(method: type, model: type, prefix: int) -> None:
             f"continues the plans of flow models, and {model.__name__} is none: omit it, or choose model=flow or a VLA"
         )
     elif issubclass(method, TrainedPrefix) and not prefix:
-        why = "needs a model that was trained with prefixes: model.prefix=4; else choose +policy/chunking=guided"
+        why = "needs a model trained with prefixes: train with model.prefix=4, or choose +policy/chunking=guided"
     else:
         return
-    raise UserError(f"policy.chunking={method.__name__} {why}")
+    raise UserError(f"+policy/chunking ({method.__name__}) {why}")
 
 
 def require_prefix(prefix: int, execute: int, chunk: int) -> None:
@@ -126,8 +126,8 @@ def require_fit(method: type, model: Mapping[str, Any], delay: int) -> None:
     interval = max(delay, model["execute"] or chunk)  # between one plan and the next
     if delay + interval > chunk:
         raise UserError(
-            f"plans begin {counted(interval, 'action')} apart and arrive {delay} late, when model.chunk={chunk} has "
-            "run out: train with a larger one, or lower the delay or model.execute"
+            f"plans begin {counted(interval, 'action')} apart and arrive {delay} late, when the one before, of "
+            f"model.chunk={chunk}, is over: train with a larger one, or lower model.execute or the delay of the network"
         )
     if issubclass(method, TrainedPrefix) and delay > (prefix := model["prefix"]):
-        raise UserError(f"plans arrive {delay} actions late, but the model was trained for model.prefix={prefix}")
+        raise UserError(f"plans arrive {delay} actions late, more than model.prefix={prefix}: train with a larger one")

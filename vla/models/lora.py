@@ -72,8 +72,8 @@ class LoRA:
                 known = sorted({name.rpartition(".")[2] for name in linear})
                 parts = sorted({name.partition(".")[0] for name in linear})
                 raise UserError(
-                    f"learner.lora.modules names {pattern}, which no linear map of the model is called: they are "
-                    f"called {', '.join(known[:20])}, in {', '.join(parts)}"
+                    f"learner.lora.modules names {pattern}, which matches no linear map of the model: there are "
+                    f"{', '.join(known[:20])} in {', '.join(parts)}"
                 )
             chosen |= dict.fromkeys(found)
         return list(chosen)

@@ -212,7 +212,7 @@ class Model(nn.Module, ABC):
                 parameter.requires_grad_(False)
         trained = {name: parameter for name, parameter in parameters.items() if parameter.requires_grad}
         if not trained:
-            raise UserError("learner.frozen leaves nothing to train")
+            raise UserError("learner.frozen leaves nothing to train: name fewer parts")
         spared, groups = _embeddings(self), dict[tuple[float, bool], list[Tensor]]()
         for name, parameter in trained.items():
             longest = max((part for part in rates if is_within(name, [part])), key=len, default=None)

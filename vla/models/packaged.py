@@ -53,7 +53,5 @@ class PackagedFile:
         for file in package.files or ():
             if file.hash is not None and file.hash.value == listed:
                 return Path(str(file.locate()))
-        raise UserError(
-            f"{self.source} {package.version} has no file with the SHA-256 {self.sha256}: it is another version than "
-            "the configuration names"
-        )
+        wanted = f"has no file with the SHA-256 {self.sha256}"
+        raise UserError(f"{self.source} {package.version} {wanted} of the configuration: install another version")

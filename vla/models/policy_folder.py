@@ -121,7 +121,7 @@ class SavedPolicy:
         elsewhere = sum(source.size for source in {*self.training.trunks.values()})
         if elsewhere > (free := free_memory()):
             raise UserError(
-                f"{self.folder} was trained on weights of {elsewhere / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free"
+                f"{self.folder} needs weights of {elsewhere / 1e9:.1f} GB, and {free / 1e9:.1f} GB of memory are free"
             )
         return TensorBudget(self.folder, _file(self.folder, WEIGHTS).stat().st_size + elsewhere)
 
@@ -143,7 +143,7 @@ def policy_folder(name: str | Path) -> Path:
             return folder
     if path.suffix == ".ckpt":
         run = path.parent.parent
-        raise UserError(f"{path} only resumes its own training: a policy is a folder, or the run that has it, {run}")
+        raise UserError(f"{path} serves only to resume its own training: name the folder of the run, {run}")
     if path.is_dir():
         best = f"; the best so far is {path / BEST}" if (path / BEST).exists() else ""
         raise UserError(f"{path} is neither a policy nor a run with one, there is no {path / POLICY / SPEC}{best}")
@@ -155,8 +155,8 @@ def _fetched(name: str) -> Path:
     """Return the folder of a policy on the hub, downloading what is not cached; each name is looked up only once."""
     if REPOSITORY.fullmatch(name) is None:
         raise UserError(
-            f"{name} is no policy on the hub: write {HUB}OWNER/NAME@REVISION, a tag, a branch or a commit; one of "
-            f"LeRobot is fine-tuned by job=train model=smolvla pretrained={name}"
+            f"{name} does not name a policy on the hub: write {HUB}OWNER/NAME@REVISION, with a tag, branch or commit; "
+            f"a policy of LeRobot is fine-tuned by job=train model=smolvla pretrained={name}"
         )
     return fetch(name, CONFIG, SPEC, WEIGHTS, TRAINING, CARD)
 
@@ -176,7 +176,7 @@ def read_policy(name: str | Path) -> SavedPolicy:
     nodes = config if isinstance(config, dict) else {}
     present = [nodes[name] for name in (*REQUIRED_NODES, *OPTIONAL_NODES) if name in nodes]
     if not nodes.keys() >= {*REQUIRED_NODES} or not all(isinstance(node, dict) for node in present):
-        raise UserError(f"{folder / CONFIG} is of no policy of this project: it lacks {', '.join(REQUIRED_NODES)}")
+        raise UserError(f"{folder / CONFIG} is of no policy of this project: it needs {', '.join(REQUIRED_NODES)}")
     with opened(_file(folder, WEIGHTS)):
         pass  # safetensors checks that the sizes of weights in the header match that of the file
     made = parse_plain(training, Training, str(folder / TRAINING))

@@ -28,7 +28,7 @@ def recompute_layers(model: nn.Module) -> None:
     """
     layers = list(_layers(model))
     if not layers:
-        raise UserError(f"learner.checkpointing=true: {type(model).__name__} has no layers to compute again")
+        raise UserError(f"learner.checkpointing=true finds no layers to recompute in {type(model).__name__}: omit it")
     for layer in layers:
         layer.forward = partial(_computed_again, layer.forward)
 

@@ -78,7 +78,7 @@ def require_trunks(model: nn.Module, named: Mapping[str, Source], policy: object
     for part, source in named.items():
         if (found := getattr(modules.get(part), "source", None)) is None or found.sha256 != source.sha256:
             here = f"here it is {found}" if found else "that is not here"
-            raise UserError(f"{policy} was trained with {part} from {source}, and {here}: get that revision")
+            raise UserError(f"{policy} was trained with {part} from {source}, and {here}: get the one of the training")
 
 
 def whole_state(model: nn.Module, state: Mapping[str, Any], named: Collection[str]) -> dict[str, Any]:

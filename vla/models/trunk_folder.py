@@ -45,8 +45,8 @@ def trunk_folder(name: str) -> Path:
     if not name.startswith(HUB):
         if not (Path(name) / CONFIG).is_file():
             raise UserError(
-                f"model.trunk={name} is no folder with pretrained weights, it has no {CONFIG}: name the one that has, "
-                f"of a policy in its {CONFIG}; on the hub: hub:…"
+                f"model.trunk={name} is no folder with pretrained weights, it has no {CONFIG}: set it, for a trained "
+                f"policy in its {CONFIG}, to a folder that has one, or to {HUB}OWNER/NAME"
             )
         return Path(name)
     return fetch(name, *FILES, advice=ADVICE)

@@ -157,7 +157,7 @@ def _record(pool: Pool, results: Sequence[Result]) -> None:
                 ended = again.error or again.outcome
                 log.warning("seed %d has no recording: when played again it ended with %s", result.seed, ended)
             elif again.steps != result.steps:
-                took = "seed %d is recorded as played again: in %d steps, where it had taken %d"
+                took = "the recording of seed %d differs from the evaluation: it has %d steps, not %d"
                 log.warning(took, result.seed, again.steps, result.steps)
 
 

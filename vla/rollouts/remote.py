@@ -95,7 +95,7 @@ class RemotePolicy:
         names = {name for names in self.state.values() for name in names or ()}
         if unknown := sorted(names - {*self.spec.state}):
             known = ", ".join(self.spec.state)
-            raise UserError(f"agent.state names {', '.join(unknown)}, the state components are {known}")
+            raise UserError(f"agent.state names {', '.join(unknown)}, which the world's state lacks: it has {known}")
         if self.actions is not None and sorted(self.actions) != sorted(self.spec.action):
             raise UserError(f"agent.actions must map {', '.join(self.spec.action)}, got {', '.join(self.actions)}")
         self.info: dict[str, Any] = {}
@@ -122,7 +122,7 @@ class RemotePolicy:
         names = action.get("names") if isinstance(action, dict) else None
         if self.actions is None and isinstance(names, list) and names != list(self.spec.action):
             theirs, ours = ", ".join(map(str, names)), ", ".join(self.spec.action)
-            raise self._connection.error(f"its actions are {theirs[:200]}, ours are {ours[:200]}: set agent.actions")
+            raise self._connection.error(f"its actions are {theirs[:200]}, the world's {ours[:200]}: set agent.actions")
         if isinstance(rate, int | float) and abs(rate - self.spec.control_hz) > 0.01 * self.spec.control_hz:
             log.warning("%s acts at %g Hz, the world at %g Hz", self.url, rate, self.spec.control_hz)
         advertised, history = (
@@ -193,12 +193,12 @@ class RemotePolicy:
         """Convert the server's chunk to ours, (k, D)."""
         if not isinstance(actions, np.ndarray) or actions.ndim != 2 or 0 in actions.shape:
             shape = getattr(actions, "shape", type(actions).__name__)
-            raise self._connection.error(f"actions are a chunk (k, D), not {shape}")
+            raise self._connection.error(f"its actions must be a chunk (k, D), got {shape}")
         wanted = self.actions or {name: Component(index, 1.0, 0.0) for index, name in enumerate(self.spec.action)}
         columns, width = [wanted[name] for name in self.spec.action], actions.shape[1]
         if width <= max(each.index for each in columns) or (self.actions is None and width != len(columns)):
             names = ", ".join(self.spec.action)
-            raise self._connection.error(f"its actions have {width} components, ours are {names}: set agent.actions")
+            raise self._connection.error(f"its actions have {width} components, the world's {names}: set agent.actions")
         mine = np.stack([each.scale * actions[:, each.index] + each.offset for each in columns], 1)
         if not np.isfinite(mine).all():
             raise self._connection.error("an action is not finite")
@@ -206,7 +206,7 @@ class RemotePolicy:
         if not self._warned and (np.abs(mine - clipped) > self._high - self._low).any():
             self._warned = True
             where = f"actions of {self.url} are far beyond the bounds of the world"
-            log.warning("%s, to which they are clipped: set agent.actions to its units", where)
+            log.warning("%s, to which they are clipped: convert their units with agent.actions", where)
         return clipped
 
 
@@ -260,7 +260,7 @@ class Connection:
             )
         except (ValueError, InvalidURI) as error:
             raise UserError(
-                f"agent.url={self.url[:200]} leads to no policy server ({error}): it looks like ws://127.0.0.1:8000"
+                f"agent.url={self.url[:200]} leads to no policy server ({error}): give one like ws://127.0.0.1:8000"
             ) from error
         return await asyncio.wait_for(self._received(self._socket), self.timeout)
 
@@ -286,7 +286,7 @@ class Connection:
             raise self.error(data.strip().splitlines()[-1][:500] if data.strip() else "an empty error")
         answer = unpack(data)
         if not isinstance(answer, dict):
-            raise self.error(f"an answer is a map, not {type(answer).__name__}")
+            raise self.error(f"its answer must be a map, got {type(answer).__name__}")
         return answer
 
     def _wait(self, work: Coroutine[Any, Any, Result]) -> Result:

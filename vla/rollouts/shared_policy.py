@@ -194,7 +194,7 @@ class _DistantPolicy:
             array = arrays.get(name, view)
             if (array.shape, array.dtype) != (view.shape, view.dtype):
                 expected, got = (f"{each.shape} {each.dtype}" for each in (view, array))
-                raise UserError(f"the world gives {name or 'a state'} of {expected}, not {got}")
+                raise UserError(f"the world gives {name or 'a state'} of {got}, but its spec says {expected}")
             view[:] = array
         has_images = all(camera in arrays for camera in self._world.cameras)
         return self._ask(kind, observation.instruction, (has_images, observation.running))

@@ -97,7 +97,7 @@ class GracefulStop(Checkpoint):
             trainer.save_checkpoint(self._path, weights_only=False)
             trainer.should_stop = True
             trainer.limit_val_batches = 0  # else Lightning validates again before it stops
-            log.info("interrupted after %s, see %s", counted(trainer.global_step, "step"), self._path)
+            log.info("interrupted after %s, saved in %s", counted(trainer.global_step, "step"), self._path)
         elif trainer.global_step % SAVE_EVERY == 0:
             trainer.save_checkpoint(self._path, weights_only=False)
 

@@ -153,7 +153,8 @@ class ClosedLoop(Callback):
         low, _ = wilson_interval(round(max(self.best, 0.0) * len(self._seeds)), len(self._seeds))
         if self.success >= low or not self._path.exists():
             return None
-        log.info("success in validation fell from %.0f to %.0f %%: %s", 100 * self.best, 100 * self.success, self._path)
+        text = "success in validation fell from %.0f to %.0f %%: the policy is a copy of %s"
+        log.info(text, 100 * self.best, 100 * self.success, self._path)
         return self._path
 
     def state_dict(self) -> dict[str, Any]:

@@ -111,7 +111,7 @@ class Estimate(Callback):
         advice = f"; if that is too much, {what_to_lower(self._config)}" if scarce else ""
         whole = f"{batches * self.seconds / 60:.1f} min for {counted(batches, 'batch')}" if batches >= 0 else "batches"
         log.info(
-            "needs about %.2f of %.1f GB of memory, %.2f of which it has, and %s of %.0f ms, without validation%s",
+            "training needs about %.2f of %.1f GB of memory (it holds %.2f) and %s of %.0f ms, without validation%s",
             *(self.memory / GB, self._available / GB, self._held / GB, whole, 1000 * self.seconds, advice),
         )
         reset_peak(pl_module.device)
@@ -131,7 +131,7 @@ class Estimate(Callback):
         """Log the actual memory and time."""
         if self._took:
             log.info(
-                "took %.2f GB of memory and %.0f ms for a batch, after an estimate of %.2f GB and %.0f ms",
+                "training took %.2f GB of memory and %.0f ms for a batch, after an estimate of %.2f GB and %.0f ms",
                 *(peak(pl_module.device) / GB, 1000 * statistics.median(self._took)),
                 *(self.memory / GB, 1000 * self.seconds),
             )

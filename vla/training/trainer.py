@@ -151,7 +151,7 @@ def what_to_lower(config: Mapping[str, Any]) -> str:
     keys = [f"{key} (now {size})" for key in SIZE_KEYS if (size := at(config, key, None))]
     return (
         f"lower {', '.join(keys)}; trainer.precision=bf16 and learner.checkpointing=true need less, and "
-        "trainer.accumulate_grad_batches=2 makes one step of two batches of half the size"
+        "half the data.batch_size with trainer.accumulate_grad_batches=2 trains on as many windows per step"
     )
 
 

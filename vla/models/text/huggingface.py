@@ -134,8 +134,8 @@ class HuggingFace(TextEncoder):
         if trained != self.encoder.sha256:
             revision = f", revision {state.get('revision')}" if state.get("revision") else ""
             raise UserError(
-                f"{self._name} is another text encoder than in training: the SHA-256 of its weights begins with "
-                f"{self.encoder.sha256[:8]}, not with {str(trained)[:8]}{revision}"
+                f"{self._name} is another text encoder than in training: its weights have the SHA-256 "
+                f"{self.encoder.sha256[:8]}…, get those with {str(trained)[:8]}…{revision}"
             )
 
 
@@ -154,8 +154,8 @@ def _folder(name: str | PackagedFile) -> Iterator[Path]:
         yield Path(name)
     else:
         advice = (
-            "nor is it a folder here: give model.text.name, of a policy in its config.json, that of a download, "
-            "or train with model/text=minilm, which is in a Python package"
+            "nor is it a folder here: set model.text.name, for a trained policy in its config.json, to the folder of a "
+            "download, or train with model/text=minilm, which is in a Python package"
         )
         yield fetch(name, *FILES, advice=advice)
 

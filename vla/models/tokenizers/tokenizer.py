@@ -61,7 +61,7 @@ class ActionTokenizer(nn.Module, ABC):
         ranges = zip(spec.action, spec.low, spec.high, strict=True)
         empty = [name for name, least, largest in ranges if not (least < largest and math.isfinite(largest - least))]
         if empty:
-            raise UserError(f"the spec must give {', '.join(empty)} a range: a low and a higher high, both finite")
+            raise UserError(f"the spec must give {', '.join(empty)} finite bounds, with low below high")
         self.bins, self.components = bins, len(spec.action)
         self.register_buffer("low", torch.as_tensor(low, dtype=torch.float32))
         self.register_buffer("high", torch.as_tensor(high, dtype=torch.float32))
@@ -231,7 +231,7 @@ class RT1Bins(EvenBins):
     def __init__(self, bins: Bins, *, spec: Spec, statistics: ActionStatistics | None = None) -> None:
         unknown = sorted(set(spec.units) - set(RT1_BOUNDS))
         if unknown:
-            raise UserError(f"tokenizer=rt1 supports the units {sorted(RT1_BOUNDS)}, the spec has {unknown}")
+            raise UserError(f"tokenizer=rt1 takes actions in {', '.join(RT1_BOUNDS)}, not in {', '.join(unknown)}")
         bound = np.array([RT1_BOUNDS[unit] for unit in spec.units])
         super().__init__(spec, -bound, bound, bins)
 

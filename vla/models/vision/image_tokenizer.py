@@ -92,7 +92,7 @@ class FilmConv(ImageEncoder):
     ) -> None:
         if not len(channels) == len(kernels) == len(strides):
             raise UserError(
-                f"channels, kernels and strides need one entry per convolution, got {channels}, {kernels}, {strides}"
+                f"model.image.channels, kernels and strides must be equally many, got {channels}, {kernels}, {strides}"
             )
         super().__init__(channels[-1] + 2 * positions)
         self.positions, self.log_pixels = positions, log_pixels

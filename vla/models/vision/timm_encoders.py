@@ -194,7 +194,7 @@ def _weights_file(name: str, repository: str | None, pretrained: Pretrained) -> 
     except UserError as error:
         if pretrained is True:
             raise
-        log.warning("%s starts at RANDOM: %s", name, error)
+        log.warning("%s starts with RANDOM weights: %s", name, error)
         return None
 
 
@@ -211,7 +211,7 @@ def _read(path: Path, name: str) -> dict[str, Tensor]:
         if not weights or not all(isinstance(each, Tensor) for each in weights.values()):
             raise ValueError
     except Exception as error:  # a pickle can raise nearly anything
-        raise UserError(f"{path} cannot be read as weights, it is damaged or something else") from error
+        raise UserError(f"{path} cannot be read as weights: it is damaged or of another kind") from error
     if "_conv_stem.weight" in weights:
         with torch.device("meta"):
             weights = dict(zip(timm.create_model(name).state_dict(), weights.values(), strict=False))

@@ -48,9 +48,9 @@ class LeRobotPolicyExporter:
             raise UserError(f"{self._folder} exists already: choose another export.folder")
         model = policy.model
         if not isinstance(model, VisionLanguageAction):
-            raise UserError(f"LeRobot has no {type(model).__name__}: this export is of model=smolvla, pi0 and pi05")
+            raise UserError(f"LeRobot has no {type(model).__name__}: this export is for model=smolvla, pi0 and pi05")
         if model.text.name is None:
-            raise UserError("LeRobot reads a sentence with a tokenizer: train with model.text.name")
+            raise UserError("LeRobot needs a tokenizer, and this policy has none: train with model.text.name=FOLDER")
         beginnings = [(ours, theirs) for theirs, ours in model.network.published]
         state = model.network.state_dict()
         weights = {renamed(name, beginnings): tensor.detach().cpu().contiguous() for name, tensor in state.items()}
@@ -79,9 +79,7 @@ def _config(model: VisionLanguageAction) -> dict[str, Any]:
     network, mode = model.network, MODES[model.action_normalizer.kind]
     of_smolvla = network.kind == "smolvla"
     if model.place != ("corner" if of_smolvla else "centre"):
-        raise UserError(
-            f"LeRobot's {network.kind} puts images that are no squares elsewhere: train without model.place"
-        )
+        raise UserError(f"LeRobot's {network.kind} places non-square images differently: train without model.place")
     if model.text.state != (in_sentence := not network.state_width):
         raise UserError(
             f"LeRobot's {network.kind} has {'the' if in_sentence else 'no'} state in the sentence: train with "

@@ -180,8 +180,8 @@ class FlowNetwork(nn.Module, ABC):
         super().__init__()
         require_multiple("vision_width", vision_width, "vision_heads", vision_heads)
         require_multiple("resolution", resolution, "patch", patch)
-        require_multiple("head_width", head_width, "two", 2)
-        require_multiple("expert_width", expert_width, "two", 2)
+        require_multiple("head_width", head_width, "for pairs of a sine and a cosine", 2)
+        require_multiple("expert_width", expert_width, "for pairs of a sine and a cosine", 2)
         self.vocabulary, self.resolution, self.action_width = vocabulary, resolution, action_width
         self.width, self.head_width, self.expert_width = width, head_width, expert_width
         # Sizes under their names in transformers: those shared by trunk and expert, and those of each part.
@@ -245,4 +245,4 @@ def sizes(width: int, feedforward: int) -> dict[str, int]:
 def require_multiple(name: str, value: int, of: str, unit: int) -> None:
     """Raise a UserError unless a size is a multiple of another."""
     if value % unit:
-        raise UserError(f"model.network.{name}={value} must be a multiple of {of}, {unit}")
+        raise UserError(f"model.network.{name}={value} must be a multiple of {unit}, {of}")

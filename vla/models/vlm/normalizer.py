@@ -67,12 +67,10 @@ class Normalizer(nn.Module):
         for name in self.statistics:
             own, found = getattr(self, name), statistics.get(f"{feature}.{name}")
             if found is None:
-                raise UserError(
-                    f"{source} has no {feature}.{name}, so what it says of {feature} cannot be put into units: "
-                    "model.statistics=demonstrations takes those of the demonstrations"
-                )
+                raise UserError(f"{source} has no statistics {feature}.{name}: choose model.statistics=demonstrations")
             if found.shape != own.shape:
-                raise UserError(f"{source} has {feature}.{name} of {found.numel()} components, not of {own.numel()}")
+                sizes = f"{found.numel()} components, not of {own.numel()}"
+                raise UserError(f"{source} has {feature}.{name} of {sizes}: choose model.statistics=demonstrations")
             own.copy_(found)
 
     def forward(self, values: Tensor) -> Tensor:

@@ -235,7 +235,7 @@ def repeated(prefix: Prefix, copies: int) -> Prefix:
 
 def _require_width(what: str, components: int, width: int) -> None:
     if components > width:
-        raise UserError(f"the {what} has {components} components, and model.network.{what}_width={width} are too few")
+        raise UserError(f"the {what} has {components} components, more than model.network.{what}_width={width}")
 
 
 def _random(network: Callable[[], FlowNetwork]) -> FlowNetwork:
@@ -259,16 +259,19 @@ def _cameras(named: dict[str, str | None] | None, spec: Spec, trunk: Trunk | Non
             )
         return [*spec.cameras]
     if missing := [camera for camera in seen if camera not in named]:
-        raise UserError(f"model.cameras has no counterpart of {', '.join(missing)}, which {trunk} sees: null for none")
+        raise UserError(f"model.cameras lacks {', '.join(missing)}, which {trunk} sees: map each to a camera or null")
     if seen and (unknown := [camera for camera in named if camera not in seen]):
-        raise UserError(f"model.cameras names {', '.join(unknown)}, and {trunk} sees {', '.join(seen)}")
+        raise UserError(f"model.cameras names {', '.join(unknown)}, but {trunk} sees {', '.join(seen)}")
     chosen = [camera for camera in named.values() if camera is not None]
     if seen and seen != [*named]:
         raise UserError(f"model.cameras names the cameras of {trunk} in another order: it sees {', '.join(seen)}")
     if unknown := [camera for camera in chosen if camera not in spec.cameras]:
-        raise UserError(f"model.cameras names {', '.join(unknown)}, and the demonstrations have {ours}")
+        raise UserError(f"model.cameras names {', '.join(unknown)}, but the demonstrations have {ours}")
     if not chosen:
         raise UserError(f"model.cameras names none of the cameras of the demonstrations, {ours}")
-    if len({*chosen}) < len(chosen):
-        raise UserError(f"model.cameras names one camera twice, {', '.join(chosen)}: null for one that has none")
+    if twice := [camera for camera in chosen if chosen.count(camera) > 1]:
+        raise UserError(
+            f"model.cameras maps two cameras of the pretrained policy to {twice[0]}: map each to a camera of its own, "
+            "or to null if there is none"
+        )
     return chosen

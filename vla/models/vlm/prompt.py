@@ -68,7 +68,7 @@ class Prompt(TextEncoder):
             ]
             if [token for piece in pieces for token in piece] != self._ids(TRIED, special=True):
                 raise UserError(
-                    f"the tokenizer of {name} does not read numbers one by one, as the prompt {TRIED!r} needs"
+                    f"the tokenizer of {name} does not read numbers one by one, as {TRIED!r} needs: choose another one"
                 )
 
     def tokenize(self, sentences: list[str]) -> Tensor:
@@ -116,7 +116,7 @@ def _padded(rows: list[list[int]], length: int) -> Tensor:
 
 def _tokenizer(name: str) -> tuple[Tokenizer, str]:
     """Return the tokenizer in a folder or on the hub, and the SHA-256 of its file."""
-    advice = f"nor is it a folder here: give model.text.name one with its {FILE}"
+    advice = f"nor is it a folder here: set model.text.name to a folder with its {FILE}"
     path = (Path(name) if Path(name).is_dir() else fetch(name, FILE, advice=advice)) / FILE
     try:
         content = read_bounded(path)

@@ -78,7 +78,7 @@ class SmolVLA(FlowNetwork):
         self.keypoints: KeypointTokens | None = None
         if keypoints:
             if image is None:
-                raise UserError(f"model.network.keypoints={keypoints} need an image encoder, model.network.image")
+                raise UserError(f"model.network.keypoints={keypoints} needs an image encoder in model.network.image")
             self.keypoints = KeypointTokens(image, keypoints, self.width)
             nn.init.normal_(self.vlm.text_model.embed_tokens.weight, std=self.width**-0.5)  # scale of keypoint tokens
             del self.vlm.vision_model, self.vlm.connector

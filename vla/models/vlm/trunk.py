@@ -51,11 +51,11 @@ class Trunk:
         self.is_policy = "input_features" in self._config  # of LeRobot, and not the vision-language model alone
         kind = self._config.get("type")
         if self.is_policy and kind not in KINDS:
-            raise UserError(f"{name} is a policy of LeRobot's type {kind}, and only {', '.join(KINDS)} are known")
+            raise UserError(f"{name} is a policy of LeRobot's type {kind}, and only {', '.join(KINDS)} are supported")
         for option, known in OPTIONS.items():
             if self._config.get(option, known[0]) not in known:
                 raise UserError(
-                    f"{name} was trained with {option}={self._config[option]}, and only {known[0]} is known"
+                    f"{name} was trained with {option}={self._config[option]}, and only {known[0]} is supported"
                 )
         self._files = sorted(self.folder.glob(WEIGHTS))
         if not self._files:
@@ -122,12 +122,10 @@ class Trunk:
             if name in own:
                 if tensor.shape != own[name].shape:
                     shapes = f"{[*tensor.shape]}, and the model has {[*own[name].shape]}"
-                    raise UserError(
-                        f"{theirs} in {self} has the shape {shapes}: its sizes are others, see model.network"
-                    )
+                    raise UserError(f"{theirs} in {self} has shape {shapes}: choose another model= or model.network")
                 found[name] = tensor.to(torch.float32, copy=True)
             elif self.is_policy and not theirs.startswith(built.unused):
-                raise UserError(f"{self} has {theirs}, which the model lacks: it has other parts, see model.network")
+                raise UserError(f"{self} has {theirs}, which the model lacks: choose another model= or model.network")
         parts = ("",) if self.is_policy else tuple(ours for _, ours in built.pretrained)
         if missing := [name for name in own if name not in found and name.startswith(parts)]:
             more = ", …" if len(missing) > 1 else ""
