@@ -80,8 +80,8 @@ class Policy:
     ) -> None:
         if device == "cuda" and not torch.cuda.is_available():
             raise UserError("policy.device=cuda, but PyTorch finds no GPU here: policy.device=auto uses the CPU")
-        available = "cuda" if torch.cuda.is_available() else "cpu"
-        self.device = torch.device(available if device == "auto" else device)
+        best_device = "cuda" if torch.cuda.is_available() else "cpu"
+        self.device = torch.device(best_device if device == "auto" else device)
         self.model, self.spec, self.lanes = model.eval().to(self.device), spec, lanes
         self.chunking = chunking
         if chunking is not None:
@@ -141,21 +141,21 @@ class Policy:
             UserError: an observation does not match the spec, in which case no lane acts.
         """
         if lanes is None:
-            return self.act([self._one(observations)], [0])[0]
-        seen = self._followed(observations, lanes)
-        self._observe({lane: each for lane, each in seen.items() if self.looking(lane)})
+            return self.act([self._observation(observations)], [0])[0]
+        lane_observations = self._assign_lanes(observations, lanes)
+        self._observe({lane: observation for lane, observation in lane_observations.items() if self.looking(lane)})
         running = dict[int, Running]()  # the end of the old plan of every lane that wants a new one
         for lane in filter(self._wants_plan, lanes):
             rest = [action for action, _ in self._lanes[lane].schedule.remaining(self._lanes[lane].step)]
             running[lane] = Running(np.reshape(rest, (-1, len(self._low))), 0)
         for lane, chunk in self._predict(running).items():
             self._lanes[lane].schedule.add(chunk, self._lanes[lane].step)
-        chosen = []
+        actions = []
         for state in (self._lanes[lane] for lane in lanes):
             action, state.info = state.schedule.at(state.step)[-1]
             state.step += 1
-            chosen.append(action)
-        return np.stack(chosen)
+            actions.append(action)
+        return np.stack(actions)
 
     def plan(self, observations: Seen, lanes: Sequence[int] | None = None) -> Array:
         """Return chunks of actions, (n, k, D) float32, clipped to the spec; the caller executes the first of each.
@@ -163,36 +163,36 @@ class Policy:
         Without `lanes`, return the chunk (k, D) for the one observation of lane 0. Raises as `act`.
         """
         if lanes is None:
-            return self.plan([self._one(observations)], [0])[0]
-        seen = self._followed(observations, lanes)
-        self._observe(seen)
-        planned = self._predict({lane: each.running or NOTHING for lane, each in seen.items()})
-        return np.stack([[action for action, _ in planned[lane]] for lane in lanes])
+            return self.plan([self._observation(observations)], [0])[0]
+        lane_observations = self._assign_lanes(observations, lanes)
+        self._observe(lane_observations)
+        plans = self._predict({lane: observation.running or NOTHING for lane, observation in lane_observations.items()})
+        return np.stack([[action for action, _ in plans[lane]] for lane in lanes])
 
-    def _one(self, seen: Any) -> Observation:
-        return seen if isinstance(seen, Observation) else Observation.from_mapping(seen, self.spec)
+    def _observation(self, value: Any) -> Observation:
+        return value if isinstance(value, Observation) else Observation.from_mapping(value, self.spec)
 
-    def _followed(self, observations: Any, lanes: Sequence[int]) -> dict[int, Observation]:
+    def _assign_lanes(self, observations: Any, lanes: Sequence[int]) -> dict[int, Observation]:
         """Return lane → its observation; a lane with another instruction begins an episode."""
-        seen = dict(zip(lanes, observations, strict=True))
-        for lane, observation in seen.items():
+        lane_observations = dict(zip(lanes, observations, strict=True))
+        for lane, observation in lane_observations.items():
             state = self._lanes.get(lane)
             if state is None or observation.instruction != state.instruction:
                 self.reset(observation.instruction, lane if state is None else state.seed, lane)
-        return seen
+        return lane_observations
 
-    def _observe(self, seen: Mapping[int, Observation]) -> None:
+    def _observe(self, lanes: Mapping[int, Observation]) -> None:
         """Encode the observations of lanes and add them to the histories, or none if one does not match the spec."""
-        for rows, frames in self._passes({lane: self.frame(observation, lane) for lane, observation in seen.items()}):
-            with self._computing():
+        for rows, frames in self._passes({lane: self.frame(observation, lane) for lane, observation in lanes.items()}):
+            with self._inference_mode():
                 tokens = self._encode(frames)
-            kept = {"present": frames["present"]}
+            features = {"present": frames["present"]}
             if tokens is None:
-                kept |= {**frames["rgb"], "state": frames["state"]}
+                features |= {**frames["rgb"], "state": frames["state"]}
             else:
-                kept["tokens"] = tokens.clone()  # a CUDA graph overwrites its output in the next call
+                features["tokens"] = tokens.clone()  # a CUDA graph overwrites its output in the next call
             for row, lane in rows.items():
-                self._lanes[lane].frames.append({name: values[row : row + 1] for name, values in kept.items()})
+                self._lanes[lane].frames.append({name: values[row : row + 1] for name, values in features.items()})
 
     def _predict(self, lanes: Mapping[int, Running]) -> dict[int, list[tuple[Array, dict[str, Any]]]]:
         """Return lane → its chunk of clipped actions, (D,) each, with the `info` of each.
@@ -201,15 +201,15 @@ class Policy:
         """
         chunks = {}
         for rows, windows in self._passes({lane: self._inputs(lane, plan) for lane, plan in lanes.items()}):
-            with self._computing():
-                predicted, probabilities = self._predict_chunk(windows)
-            actions = np.clip(predicted.float().cpu().numpy(), self._low, self._high)
+            with self._inference_mode():
+                prediction, probabilities = self._predict_chunk(windows)
+            actions = np.clip(prediction.float().cpu().numpy(), self._low, self._high)
             for row, lane in rows.items() if self.chunking else ():
-                over = lanes[lane].actions[: lanes[lane].delay][: len(actions[row])]
-                actions[row, : len(over)] = over
+                prefix = lanes[lane].actions[: lanes[lane].delay][: len(actions[row])]
+                actions[row, : len(prefix)] = prefix
             infos: list[list[dict[str, Any]]] = [[{} for _ in chunk] for chunk in actions]
             if probabilities is not None:
-                infos = [[{"probabilities": each} for each in chunk] for chunk in probabilities.float().cpu().numpy()]
+                infos = [[{"probabilities": item} for item in chunk] for chunk in probabilities.float().cpu().numpy()]
             chunks |= {lane: list(zip(actions[row], infos[row], strict=True)) for row, lane in rows.items()}
         return chunks
 
@@ -221,18 +221,18 @@ class Policy:
         passes: dict[int, list[dict[int, int]]] = {}  # length of the instruction → passes, each row → lane
         for lane in inputs:
             state = self._lanes[lane]
-            row, of_length = state.seed % self.lanes, passes.setdefault(state.text.shape[1], [])
-            rows = next((rows for rows in of_length if row not in rows), None)
+            row, candidates = state.seed % self.lanes, passes.setdefault(state.text.shape[1], [])
+            rows = next((rows for rows in candidates if row not in rows), None)
             if rows is None:
-                of_length.append(rows := {})
+                candidates.append(rows := {})
             rows[row] = lane
         for rows in chain.from_iterable(passes.values()):
             padding = next(iter(rows.values()))
             batches = [inputs[rows.get(row, padding)] for row in range(self.lanes)]
-            yield rows, batches[0] if self.lanes == 1 else _joined(batches)
+            yield rows, batches[0] if self.lanes == 1 else _concatenate(batches)
 
     @contextmanager
-    def _computing(self) -> Iterator[None]:
+    def _inference_mode(self) -> Iterator[None]:
         with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
             yield
 
@@ -255,9 +255,9 @@ class Policy:
         state = self._lanes[lane]
         padding = {name: torch.zeros_like(values) for name, values in state.frames[0].items()}
         frames = [*state.frames, *[padding] * (self.history - len(state.frames))]
-        joined = {name: torch.cat([frame[name] for frame in frames], 1) for name in padding}
-        rgb = {name: joined.pop(name) for name in self.spec.cameras if name in joined}
-        return {**joined, "rgb": rgb, "text": state.text}
+        inputs = {name: torch.cat([frame[name] for frame in frames], 1) for name in padding}
+        rgb = {name: inputs.pop(name) for name in self.spec.cameras if name in inputs}
+        return {**inputs, "rgb": rgb, "text": state.text}
 
     def frame(self, observation: Observation, lane: int = 0) -> Batch:
         """Convert an observation of a lane, with images of any size, to a batch of one frame that the model sees.
@@ -268,8 +268,8 @@ class Policy:
         spec = self.spec
         if observation.state.shape != (len(spec.state),):
             raise UserError(f"the state must hold {', '.join(spec.state)}, but has the shape {observation.state.shape}")
-        if wrong := [name for name, value in zip(spec.state, observation.state, strict=True) if not isfinite(value)]:
-            raise UserError(f"the observation's state is not finite in {', '.join(wrong)}")
+        if names := [name for name, value in zip(spec.state, observation.state, strict=True) if not isfinite(value)]:
+            raise UserError(f"the observation's state is not finite in {', '.join(names)}")
         rgb = spec.images(observation)
         if missing := [camera for camera in spec.cameras if camera not in rgb]:
             raise UserError(f"the observation lacks {', '.join(missing)}: the policy needs {', '.join(spec.cameras)}")
@@ -291,10 +291,10 @@ class Policy:
         return torch.from_numpy(values.copy())[None, None].to(self.device)
 
 
-def _joined(batches: Sequence[Batch]) -> Batch:
+def _concatenate(batches: Sequence[Batch]) -> Batch:
     """Concatenate batches, which may hold mappings of tensors."""
     return {
-        name: _joined([batch[name] for batch in batches])
+        name: _concatenate([batch[name] for batch in batches])
         if isinstance(value, dict)
         else torch.cat([batch[name] for batch in batches])
         for name, value in batches[0].items()

@@ -75,22 +75,22 @@ class Prefetcher:
 
     def __iter__(self) -> Iterator[Batch]:
         maker = ThreadPoolExecutor(1, "windows")  # unlike a daemon thread, joined at exit
-        pending: deque[Future[Batch]] = deque()
+        futures: deque[Future[Batch]] = deque()
         try:
             for windows in self._plan():
-                pending.append(maker.submit(self._make_batch, windows))
-                if len(pending) > self._ahead:
-                    yield self._wait_for(pending.popleft())
-            while pending:
-                yield self._wait_for(pending.popleft())
+                futures.append(maker.submit(self._make_batch, windows))
+                if len(futures) > self._ahead:
+                    yield self._wait_for(futures.popleft())
+            while futures:
+                yield self._wait_for(futures.popleft())
         finally:
             maker.shutdown(wait=False, cancel_futures=True)
 
-    def _wait_for(self, batch: Future[Batch]) -> Batch:
-        started = time.perf_counter()
-        made = batch.result()
-        self.waited += time.perf_counter() - started
-        return made
+    def _wait_for(self, future: Future[Batch]) -> Batch:
+        start = time.perf_counter()
+        batch = future.result()
+        self.waited += time.perf_counter() - start
+        return batch
 
 
 class WindowDataModule(LightningDataModule):
@@ -131,35 +131,35 @@ class WindowDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         self.batch_size = batch_size
-        self._folder, self._spec, self._episodes, self._more = Path(folder), spec, episodes, more
+        self._folder, self._spec, self._episodes, self._further_folders = Path(folder), spec, episodes, more
         self._history, self._chunk = history, chunk
         self._seed, self.ahead, self._tokenize = seed, ahead, tokenize
         self._fraction, self._validation_windows = validation_fraction, validation_windows
 
     def setup(self, stage: str | None = None) -> None:
         """Open the stores and split their episodes; a UserError if they do not match the spec, or are too few."""
-        stores = [EpisodeStore(self._folder, self._episodes), *map(EpisodeStore, self._more)]
-        rows = [max((entry.end for entry in store.episodes), default=0) for store in stores]
-        trained, unseen = list[Array](), list[Array]()
-        for store, first in zip(stores, np.cumsum([0, *rows]), strict=False):
+        stores = [EpisodeStore(self._folder, self._episodes), *map(EpisodeStore, self._further_folders)]
+        counts = [max((entry.end for entry in store.episodes), default=0) for store in stores]
+        training, holdout = list[Array](), list[Array]()
+        for store, offset in zip(stores, np.cumsum([0, *counts]), strict=False):
             name = f"the episode store {store.folder}"
             self._spec.require_input(store.spec, "the model", name)
             if store.spec.truth:  # a further store may lack it, which becomes NaN
                 replace(store.spec, truth=self._spec.truth).require(store.spec, "the model", name)
             for entry in store.episodes:
-                side = unseen if held_out(entry.recording, self._fraction) else trained
-                side.append(first + np.arange(entry.start, entry.end))
+                windows = holdout if held_out(entry.recording, self._fraction) else training
+                windows.append(offset + np.arange(entry.start, entry.end))
         episodes = [entry for store in stores for entry in store.episodes]
-        if not trained or (self._fraction > 0 and not unseen):
+        if not training or (self._fraction > 0 and not holdout):
             raise UserError(
-                f"of {counted(len(episodes), 'episode')} {len(trained)} would train, {len(unseen)} validate: raise "
+                f"of {counted(len(episodes), 'episode')} {len(training)} would train, {len(holdout)} validate: raise "
                 f"collect.episodes, or set data.validation_fraction (now {self._fraction})"
             )
         self._digest = digest_of(episodes)
-        self.training_windows = np.concatenate(trained)  # row numbers
-        self.held_out_windows = np.concatenate([np.empty(0, np.int64), *unseen])
+        self.training_windows = np.concatenate(training)  # row numbers
+        self.held_out_windows = np.concatenate([np.empty(0, np.int64), *holdout])
         layout = self._history, self._chunk, self._on_gpu(), self._spec
-        self._batchers, self._starts = [WindowBatcher(store, *layout) for store in stores], np.cumsum([0, *rows])[:-1]
+        self._batchers, self._starts = [WindowBatcher(store, *layout) for store in stores], np.cumsum([0, *counts])[:-1]
 
     def make_batch(self, windows: Array) -> Batch:
         """Return the batch of `windows` (B,), row numbers counted over all stores; its windows are sorted by store.
@@ -203,11 +203,11 @@ class WindowDataModule(LightningDataModule):
         if not len(self.held_out_windows):
             return []
         rank, processes = self._place()
-        share = self.batch_size * processes
-        batches = max(1, min(self._validation_windows, len(self.held_out_windows)) // share)
+        global_batch = self.batch_size * processes
+        batches = max(1, min(self._validation_windows, len(self.held_out_windows)) // global_batch)
         # Whole batches: one shape for a compiled model, and the same number of steps in all processes.
-        spread = np.linspace(0, len(self.held_out_windows) - 1, batches * share).round().astype(np.int64)
-        windows = self.held_out_windows[spread].reshape(batches, self.batch_size, processes)
+        indices = np.linspace(0, len(self.held_out_windows) - 1, batches * global_batch).round().astype(np.int64)
+        windows = self.held_out_windows[indices].reshape(batches, self.batch_size, processes)
         return Prefetcher(self._make_batch, lambda: windows[:, :, rank], self.ahead, batches)
 
     def order(self, step: int, rank: int = 0, processes: int = 1) -> Array:
@@ -215,12 +215,12 @@ class WindowDataModule(LightningDataModule):
 
         The order is a sequence of permutations of all windows, divided into batches.
         """
-        first = (step * processes + rank) * self.batch_size
+        start = (step * processes + rank) * self.batch_size
         count = len(self.training_windows)
-        shuffle, place = np.divmod(np.arange(first, first + self.batch_size), count)
+        shuffle, place = np.divmod(np.arange(start, start + self.batch_size), count)
         numbers = range(shuffle[0], shuffle[-1] + 1)
-        chosen = [_shuffled(count, self._seed, number)[place[shuffle == number]] for number in numbers]
-        return self.training_windows[np.concatenate(chosen)]
+        indices = [_permutation(count, self._seed, number)[place[shuffle == number]] for number in numbers]
+        return self.training_windows[np.concatenate(indices)]
 
     def _make_batch(self, windows: Array) -> Batch:
         """Return the batch of windows with its tokenized instructions, in page-locked memory if a GPU is to read it."""
@@ -245,5 +245,5 @@ class WindowDataModule(LightningDataModule):
 
 
 @lru_cache(maxsize=2)
-def _shuffled(count: int, seed: Seed, number: int) -> Array:
+def _permutation(count: int, seed: Seed, number: int) -> Array:
     return np.random.default_rng([seed, number]).permutation(count)

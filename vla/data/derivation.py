@@ -38,24 +38,24 @@ def derive_store(
     """
     for store in stores[1:]:
         store.spec.require(stores[0].spec, f"the episode store {store.folder}", f"{stores[0].folder}")
-    chosen = _choose(stores, where or {})
-    if not any(entry.stored for seeds in chosen.values() for copies in seeds.values() for _, entry in copies):
-        fitting = f" that fit inspect.where={dict(where)}" if where else ""
-        raise UserError(f"{', '.join(str(store.folder) for store in stores)}: there are no episodes{fitting}")
+    selection = _choose(stores, where or {})
+    if not any(entry.stored for seeds in selection.values() for copies in seeds.values() for _, entry in copies):
+        condition = f" that fit inspect.where={dict(where)}" if where else ""
+        raise UserError(f"{', '.join(str(store.folder) for store in stores)}: there are no episodes{condition}")
     draft = folder.with_name(f".{folder.name}.draft")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    busy = f"another process writes {folder}: wait for it, or choose another inspect.into"
-    lock = locked(folder.with_name(f".{folder.name}.lock"), busy)
+    message = f"another process writes {folder}: wait for it, or choose another inspect.into"
+    lock = locked(folder.with_name(f".{folder.name}.lock"), message)
     shutil.rmtree(draft, ignore_errors=True)  # left by a process that was killed
     try:
         if folder.exists():
             raise UserError(f"{folder} exists already and is left alone: choose another inspect.into")
         codecs = {store.codec for store in stores}
         codec = Codec("lossless") if len(codecs) > 1 else codecs.pop()  # no further loss
-        new = EpisodeStore.create_or_open(draft, stores[0].spec, _config(chosen, stores, where), codec)
-        with new.writing():
-            seeds = [(seed, copies) for part in chosen.values() for seed, copies in sorted(part.items())]
-            damaged = [seed for seed, copies in track(seeds, "writing") if not _write(new, copies, repair)]
+        target = EpisodeStore.create_or_open(draft, stores[0].spec, _config(selection, stores, where), codec)
+        with target.writing():
+            seeds = [(seed, copies) for part in selection.values() for seed, copies in sorted(part.items())]
+            damaged_seeds = [seed for seed, copies in track(seeds, "writing") if not _write(target, copies, repair)]
         os.rename(draft, folder)
     except BaseException as error:
         shutil.rmtree(draft, ignore_errors=True)
@@ -66,44 +66,44 @@ def derive_store(
     finally:
         Path(lock.lock_file).unlink(missing_ok=True)  # while it is held: a later process creates a new one
         lock.release()
-    return damaged
+    return damaged_seeds
 
 
 def _choose(stores: Sequence[EpisodeStore], where: Mapping[str, Any]) -> Chosen:
     matches = episode_filter(where, [entry for store in stores for entry in store.tried])
-    chosen: Chosen = {}
+    selection: Chosen = {}
     for store in stores:
         for config, entries in entries_by_config(store):
             key = json.dumps(config)
             for entry in filter(matches, entries):
-                chosen.setdefault(key, {}).setdefault(entry.seed, []).append((store, entry))
-    return chosen
+                selection.setdefault(key, {}).setdefault(entry.seed, []).append((store, entry))
+    return selection
 
 
-def _config(chosen: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, Any] | None) -> dict[str, Any]:
+def _config(selection: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the config of the episodes if one collection could have produced them all, else that of `Derived`."""
     conditions = [condition for store in stores if store.derived for condition in store.config["where"]]
     conditions += [dict(where)] if where else []
-    (config, seeds), *others = chosen.items()
-    alike = len({store.codec.loss for store in stores}) == 1
-    if not others and not conditions and alike and max(seeds) - min(seeds) == len(seeds) - 1:
+    (config, seeds), *other_configs = selection.items()
+    same_loss = len({store.codec.loss for store in stores}) == 1
+    if not other_configs and not conditions and same_loss and max(seeds) - min(seeds) == len(seeds) - 1:
         return json.loads(config)
-    return {"parts": [(json.loads(config), len(seeds)) for config, seeds in chosen.items()], "where": conditions}
+    return {"parts": [(json.loads(config), len(seeds)) for config, seeds in selection.items()], "where": conditions}
 
 
-def _write(new: EpisodeStore, copies: Copies, repair: bool) -> bool:
+def _write(target: EpisodeStore, copies: Copies, repair: bool) -> bool:
     """Add a seed to a store from its first undamaged copy; returns whether there was one."""
-    readable = [(source, entry) for source, entry in copies if entry.outcome != LOST]
-    for source, entry in sorted(readable, key=lambda copy: not copy[1].stored):  # an episode rather than a failure
+    candidates = [(source, entry) for source, entry in copies if entry.outcome != LOST]
+    for source, entry in sorted(candidates, key=lambda copy: not copy[1].stored):  # an episode rather than a failure
         if not entry.stored:
-            new.fail(without_rows(entry))
+            target.fail(without_rows(entry))
             return True
         try:
-            new.append(episode_of(source, entry), source.packed(entry) if source.codec == new.codec else None)
+            target.append(episode_of(source, entry), source.packed(entry) if source.codec == target.codec else None)
             return True
         except DamageError:
             if not repair:
                 raise
-    _, entry = (readable or copies)[0]
-    new.fail(replace(without_rows(entry), outcome=DAMAGED))
+    _, entry = (candidates or copies)[0]
+    target.fail(replace(without_rows(entry), outcome=DAMAGED))
     return False

@@ -31,8 +31,8 @@ def flat(draws: Mapping[str, Any]) -> dict[str, Any]:
 
 def leaves(value: Any) -> list[Any]:
     """Return the scalars in a draw, at any depth of nested lists."""
-    plain = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
-    return [leaf for item in plain for leaf in leaves(item)] if isinstance(plain, (list, tuple)) else [plain]
+    data = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+    return [leaf for item in data for leaf in leaves(item)] if isinstance(data, (list, tuple)) else [data]
 
 
 def episode_filter(where: Mapping[str, Any], entries: Iterable[Entry]) -> Callable[[Entry], bool]:
@@ -43,18 +43,18 @@ def episode_filter(where: Mapping[str, Any], entries: Iterable[Entry]) -> Callab
         where: name of a fact → condition.
         entries: the entries to filter; each name must occur in one of them.
     """
-    known = dict.fromkeys(name for entry in entries for name in _facts(entry))
+    names = dict.fromkeys(name for entry in entries for name in _facts(entry))
     for name in where:
-        if name not in known:
-            hint = suggestion(name, known) or f": there are {', '.join(known)}"
+        if name not in names:
+            hint = suggestion(name, names) or f": there are {', '.join(names)}"
             raise UserError(f"inspect.where: no episode has {name}{hint}")
     conditions = {name: _condition(name, value) for name, value in where.items()}
 
     def matches(entry: Entry) -> bool:
         facts = _facts(entry)
         return all(
-            bool(values := leaves(facts.get(name, []))) and all(map(holds, values))
-            for name, holds in conditions.items()
+            bool(values := leaves(facts.get(name, []))) and all(map(condition, values))
+            for name, condition in conditions.items()
         )
 
     return matches
@@ -64,19 +64,19 @@ def _facts(entry: Entry) -> dict[str, Any]:
     return {**{name: getattr(entry, name) for name in FACTS}, **flat(entry.draws)}
 
 
-def _condition(name: str, wanted: Any) -> Callable[[Any], bool]:
-    """Return the predicate of a scalar; a UserError if `wanted` is no condition."""
-    texts = wanted if isinstance(wanted, list) else [wanted]
+def _condition(name: str, criterion: Any) -> Callable[[Any], bool]:
+    """Return the predicate of a scalar; a UserError if `criterion` is no condition."""
+    texts = criterion if isinstance(criterion, list) else [criterion]
     if texts and all(isinstance(text, str) for text in texts):
         return lambda value: isinstance(value, str) and any(fnmatchcase(value, text) for text in texts)
-    if isinstance(wanted, (bool, int, float)):
-        return lambda value: isinstance(value, bool) is isinstance(wanted, bool) and bool(value == wanted)
-    if isinstance(wanted, list) and len(wanted) == 2 and all(end is None or _is_number(end) for end in wanted):
-        low, high = (bound if end is None else end for end, bound in zip(wanted, (-np.inf, np.inf), strict=True))
+    if isinstance(criterion, (bool, int, float)):
+        return lambda value: isinstance(value, bool) is isinstance(criterion, bool) and bool(value == criterion)
+    if isinstance(criterion, list) and len(criterion) == 2 and all(end is None or _is_number(end) for end in criterion):
+        low, high = (bound if end is None else end for end, bound in zip(criterion, (-np.inf, np.inf), strict=True))
         return lambda value: _is_number(value) and low <= value <= high
     raise UserError(
         f"inspect.where: {name} must be a text, in which * stands for anything, a number, a range [low, high] or a "
-        f"list of texts, not {wanted!r}"
+        f"list of texts, not {criterion!r}"
     )
 
 

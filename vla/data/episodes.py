@@ -87,14 +87,14 @@ class EpisodeStore:
     ) -> EpisodeStore:
         """Open the store in `folder`, or create an empty one, whose codec by default suits its image size (UserError:
         the store has another spec or config, other losses than `codec`, or lacks its `store.json`)."""
-        folder, plain = Path(folder), json.loads(dumps(config))
+        folder, plain_config = Path(folder), json.loads(dumps(config))
         if not is_store(folder):
             folder.mkdir(parents=True, exist_ok=True)
             with FileLock(folder / "lock"):
-                write_header(folder, spec, plain, codec or Codec.suited(spec))
+                write_header(folder, spec, plain_config, codec or Codec.suited(spec))
         store = cls(folder)
         spec.require(store.spec, "this task", f"the episode store {folder}")
-        store.require(plain)
+        store.require(plain_config)
         store.require_codec(codec)
         return store
 
@@ -102,15 +102,15 @@ class EpisodeStore:
         """Raise a UserError if the episodes have another config; a derived store, chosen explicitly, may have any."""
         if self.derived:
             return
-        wanted, stored = canonical(json.loads(dumps(config))), canonical(self.config)
-        different = sorted(key for key in {*wanted, *stored} if wanted.get(key) != stored.get(key))
-        if different:
-            raise UserError(f"{self.folder} has episodes of another {', '.join(different)}: set another collect.folder")
+        new_config, stored_config = canonical(json.loads(dumps(config))), canonical(self.config)
+        keys = sorted(key for key in {*new_config, *stored_config} if new_config.get(key) != stored_config.get(key))
+        if keys:
+            raise UserError(f"{self.folder} has episodes of another {', '.join(keys)}: set another collect.folder")
 
     def lacks(self, key: str, node: Any) -> bool:
         """Return whether the store is derived, and no part of it has `node` under `key` in its config."""
-        wanted = canonical(json.loads(dumps(node)))
-        return self.derived and all(canonical(config.get(key)) != wanted for config, _ in self.config["parts"])
+        plain_node = canonical(json.loads(dumps(node)))
+        return self.derived and all(canonical(config.get(key)) != plain_node for config, _ in self.config["parts"])
 
     def require_codec(self, codec: Codec | None) -> None:
         """Raise a UserError if the images have other losses than those of `codec`; None accepts any."""
@@ -122,14 +122,14 @@ class EpisodeStore:
     def require_first_seed(self, seed: int) -> None:
         """Raise a UserError if the first episode has another seed; a derived store may begin anywhere."""
         if self.tried and not self.derived and self.tried[0].seed != seed:
-            first = self.tried[0].seed
-            raise UserError(f"{self.folder} starts at seed {first}, not {seed}: set collect.seed={first}")
+            first_seed = self.tried[0].seed
+            raise UserError(f"{self.folder} starts at seed {first_seed}, not {seed}: set collect.seed={first_seed}")
 
     def require_growable(self) -> None:
         """Raise a UserError if no episodes may be added, because the present ones were copied from other stores."""
         if self.derived:
-            most = len(self.episodes)
-            raise UserError(f"{self.folder} was derived from other stores and cannot grow: set collect.episodes={most}")
+            size = len(self.episodes)
+            raise UserError(f"{self.folder} was derived from other stores and cannot grow: set collect.episodes={size}")
 
     def require_episodes(self) -> None:
         """Raise a UserError if there are no episodes."""
@@ -169,7 +169,7 @@ class EpisodeStore:
         if self._rows == 0:  # an empty file cannot be mapped
             return np.empty((0, *shape), dtype)
         large = self._rows * sum(column.size for column in self._columns.values()) > IN_MEMORY * memory()
-        return self._columns[field].rows(self._rows, partial(self._image_changed, field), scattered and large)
+        return self._columns[field].rows(self._rows, partial(self._image_error, field), scattered and large)
 
     def packed(self, entry: Entry) -> dict[str, list[bytes]]:
         """Return the compressed images of an episode, by field; a DamageError if one is damaged."""
@@ -178,8 +178,8 @@ class EpisodeStore:
 
     def size(self, field: str, entry: Entry) -> int:
         """Return the size of a field of an episode on disk [bytes]."""
-        before, after = (self._columns[field].sizes(rows) for rows in (entry.start, entry.end))
-        return sum(after) - sum(before)
+        starts, ends = (self._columns[field].sizes(rows) for rows in (entry.start, entry.end))
+        return sum(ends) - sum(starts)
 
     def read(self, entry: Entry) -> dict[str, Array]:
         """Read one episode as field → (steps, …) rows; a DamageError if a checksum differs.
@@ -187,16 +187,16 @@ class EpisodeStore:
         A UserError if it is larger than the memory: a few compressed bytes can promise any image.
         """
         size = entry.steps * sum(column.size for column in self._columns.values())
-        if self.codec != RAW and size > (most := memory()):
+        if self.codec != RAW and size > (limit := memory()):
             raise UserError(
                 f"seed {entry.seed} in {self.folder} unpacks to {size / 1e9:.0f} GB, and this machine has "
-                f"{most / 1e9:.0f} GB of memory: leave it out, or read it on a larger machine"
+                f"{limit / 1e9:.0f} GB of memory: leave it out, or read it on a larger machine"
             )
         sources = {field: self.rows(field) for field in self.fields}
         rows = {field: np.array(source[entry.span]) for field, source in sources.items()}
         for field, values in rows.items():
             if len(values) < entry.steps or _checksum(sources[field], entry.span, values) != entry.crc.get(field):
-                raise self._changed(entry.seed)
+                raise self._rows_error(entry.seed)
         return rows
 
     def verify(self, entries: Iterable[Entry], rows: Mapping[str, Rows]) -> None:
@@ -205,17 +205,17 @@ class EpisodeStore:
         for entry in entries:
             try:
                 if any(_checksum(source, entry.span) != entry.crc.get(field) for field, source in rows.items()):
-                    raise self._changed(entry.seed)
+                    raise self._rows_error(entry.seed)
             except DamageError as damage:  # also of a compressed image, which is named by its step
                 damages[entry.seed] = damage
         if damages:
-            raise self._changed(*damages) if len(damages) > 1 else damages.popitem()[1]
+            raise self._rows_error(*damages) if len(damages) > 1 else damages.popitem()[1]
 
-    def _changed(self, *seeds: int) -> DamageError:
-        which = f"seed {seeds[0]}" if len(seeds) == 1 else f"the seeds {listed(seeds)}"
-        return DamageError(f"the rows of {which} in {self.folder} were changed on disk")
+    def _rows_error(self, *seeds: int) -> DamageError:
+        seeds_text = f"seed {seeds[0]}" if len(seeds) == 1 else f"the seeds {listed(seeds)}"
+        return DamageError(f"the rows of {seeds_text} in {self.folder} were changed on disk")
 
-    def _image_changed(self, field: str, row: int) -> DamageError:
+    def _image_error(self, field: str, row: int) -> DamageError:
         entry = next(entry for entry in self.tried if entry.start <= row < entry.end)
         image = f"{field} of step {row - entry.start}"
         message = f"{image} of seed {entry.seed} in {self.folder} was changed on disk"
@@ -254,7 +254,7 @@ class EpisodeStore:
 
         `packed` are its compressed images from another store with the same codec, so that JPEG loses nothing more.
         """
-        if len({seen.instruction for seen in episode.observations}) > 1:
+        if len({observation.instruction for observation in episode.observations}) > 1:
             raise UserError(
                 f"seed {episode.seed} has several instructions, and a store keeps one per episode: give episodes below "
                 f"seed {FIRST_SEED} one each"
@@ -319,35 +319,35 @@ class EpisodeStore:
     def _refresh(self) -> None:
         """Read the index, which alone says what the store holds, whatever else the files of the fields contain."""
         files = [column.files[0] for column in self._columns.values()]
-        if not self._index.exists() and (there := [path for path in files if path.exists()]):
-            raise UserError(f"{self._index} is missing, which {there[0].name} beside it needs: {REMEDY}")
+        if not self._index.exists() and (orphans := [path for path in files if path.exists()]):
+            raise UserError(f"{self._index} is missing, which {orphans[0].name} beside it needs: {REMEDY}")
         self.tried, self._index_size = read_index(self._index, self.derived, self._damaged)
         self.episodes = [entry for entry in self.tried if entry.stored][: self._limit]
         self._rows = max((entry.end for entry in self.tried), default=0)
         for column in self._columns.values():
-            whole = column.whole(self._rows)
-            if whole < self._rows and not self._damaged:
+            complete_rows = column.whole(self._rows)
+            if complete_rows < self._rows and not self._damaged:
                 raise UserError(f"{column.files[0]} is shorter than its index says: {SALVAGE}")
-            self._rows = whole
+            self._rows = complete_rows
 
 
 def rows_of(spec: Spec, episode: Episode) -> dict[str, Array]:
     """Return the rows of an episode, field → (steps, …), see `fields_of`; a UserError if it does not fit the spec."""
-    seen = episode.observations
+    steps = episode.observations
     columns: dict[str, Any] = {"action": episode.actions, "executed": episode.executed}
     try:
-        columns["state"] = [each.state for each in seen]
-        columns |= {f"rgb_{camera}": [each.rgb[camera] for each in seen] for camera in spec.cameras}
-        columns |= {f"depth_{camera}": [each.depth[camera] for each in seen] for camera in spec.depth}
-        names = [name for name, _ in spec.truth]
-        columns["truth"] = [np.hstack([np.ravel((each.truth or {})[name]) for name in names]) for each in seen if names]
+        columns["state"] = [step.state for step in steps]
+        columns |= {f"rgb_{camera}": [step.rgb[camera] for step in steps] for camera in spec.cameras}
+        columns |= {f"depth_{camera}": [step.depth[camera] for step in steps] for camera in spec.depth}
+        keys = [name for name, _ in spec.truth]
+        columns["truth"] = [np.hstack([np.ravel((step.truth or {})[name]) for name in keys]) for step in steps if keys]
     except KeyError as error:
         raise UserError(f"seed {episode.seed}: an observation lacks {error}, which the spec names") from error
     rows = dict[str, Array]()
     for name, (shape, dtype) in fields_of(spec).items():
         column = np.asarray(columns[name])
-        if column.shape != (len(seen), *shape) or not np.can_cast(column.dtype, dtype, "same_kind"):
-            raise UserError(f"{name} must be {(len(seen), *shape)} {dtype}, got {column.shape} {column.dtype}")
+        if column.shape != (len(steps), *shape) or not np.can_cast(column.dtype, dtype, "same_kind"):
+            raise UserError(f"{name} must be {(len(steps), *shape)} {dtype}, got {column.shape} {column.dtype}")
         rows[name] = np.ascontiguousarray(column, dtype)
     return rows
 

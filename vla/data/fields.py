@@ -39,7 +39,7 @@ class ScatteredRows:
 
     def __init__(self, field: Field, count: int, damaged: Damaged) -> None:
         self.shape, self.dtype, self.codec = (count, *field.shape), field.dtype, field.codec
-        self._size, self._damaged = field.size, damaged
+        self._size, self._damage_error = field.size, damaged
         self._file = field.files[0].open("rb", buffering=0)
         self._descriptor = self._file.fileno()
         os.posix_fadvise(self._descriptor, 0, 0, os.POSIX_FADV_RANDOM)
@@ -60,24 +60,24 @@ class ScatteredRows:
         places = self._places(rows)
 
         def unpack(number: int) -> None:
-            packed = self._packed(int(rows[number]), *places[number])
+            packed = self._read_packed(int(rows[number]), *places[number])
             try:
                 images[number] = decode(packed, self.codec, self.shape[1:], self.dtype)
             except UserError as error:
-                raise self._damaged(int(rows[number])) from error
+                raise self._damage_error(int(rows[number])) from error
 
         if self._ends is not None:
             in_threads(unpack, len(rows))
             return out
         for row, image, (start, size) in zip(rows, images, places, strict=True):
             if os.preadv(self._descriptor, [image], start) < size:
-                raise self._damaged(int(row))
+                raise self._damage_error(int(row))
         return out
 
     def packed(self, rows: slice) -> list[bytes]:
         """Return consecutive rows in compressed form."""
         index = np.arange(*rows.indices(len(self)))
-        return [self._packed(row, *place) for row, place in zip(index.tolist(), self._places(index), strict=True)]
+        return [self._read_packed(row, *place) for row, place in zip(index.tolist(), self._places(index), strict=True)]
 
     def _places(self, rows: Array) -> list[tuple[int, int]]:
         """Return offset and size [bytes] of rows in the file, and make the kernel begin to read them."""
@@ -87,18 +87,18 @@ class ScatteredRows:
             starts = np.where(rows > 0, self._ends["end"][rows - 1], 0)
             ends = self._ends["end"][rows]
             sizes = ends - starts  # unsigned: negative ones are large
-            if len(wrong := np.flatnonzero((sizes > self._size + MAX_OVERHEAD) | (ends > np.iinfo(np.int64).max))):
-                raise self._damaged(int(rows[wrong[0]]))
+            if len(outliers := np.flatnonzero((sizes > self._size + MAX_OVERHEAD) | (ends > np.iinfo(np.int64).max))):
+                raise self._damage_error(int(rows[outliers[0]]))
             places = list(zip(starts.tolist(), sizes.tolist(), strict=True))
         for place in places:
             os.posix_fadvise(self._descriptor, *place, os.POSIX_FADV_WILLNEED)
         return places
 
-    def _packed(self, row: int, start: int, size: int) -> bytes:
+    def _read_packed(self, row: int, start: int, size: int) -> bytes:
         assert self._ends is not None, "raw rows are not compressed"
         packed = os.pread(self._descriptor, size, start)
         if zlib.crc32(packed) != self._ends["crc"][row]:
-            raise self._damaged(row)
+            raise self._damage_error(row)
         return packed
 
 
@@ -132,8 +132,8 @@ class Field:
         rows = min(rows, sizes[-1] // (self.size if self.codec == "raw" else END.itemsize))
         if self.codec == "raw" or not rows:
             return rows
-        within = np.flatnonzero(np.fromfile(self.files[1], END, rows)["end"] <= sizes[0])
-        return int(within[-1]) + 1 if len(within) else 0  # a changed end is detected when the image is read
+        indices = np.flatnonzero(np.fromfile(self.files[1], END, rows)["end"] <= sizes[0])
+        return int(indices[-1]) + 1 if len(indices) else 0  # a changed end is detected when the image is read
 
     def rows(self, count: int, damaged: Damaged, scattered: bool = False) -> Rows:
         """Return the first `count` > 0 rows, which are read when they are indexed; `scattered`: for random order."""

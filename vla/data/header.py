@@ -105,13 +105,13 @@ def read_header(folder: Path) -> tuple[Header, Spec]:
         content = read_bounded(path, MAX_HEADER_BYTES)
         version = parse_json(content, dict[str, Any], str(path)).get("format")
         if version == FORMAT:
-            return _parsed(content, path)
+            return _parse(content, path)
     except UserError as error:
         raise UserError(f"{error}: {REMEDY}") from error
     raise UserError(f"{path} has format {str(version)[:20]}, this version reads {FORMAT}: collect again")
 
 
-def _parsed(content: bytes, path: Path) -> tuple[Header, Spec]:
+def _parse(content: bytes, path: Path) -> tuple[Header, Spec]:
     header = parse_json(content, Header, str(path))
     spec = Spec.from_dict(header.spec, f"{path}: spec")
     if "parts" in header.config:

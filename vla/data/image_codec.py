@@ -27,9 +27,9 @@ def encode(image: Array, codec: Images, quality: int | None) -> bytes:
     """Compress an image; `quality` is that of JPEG."""
     if codec == "lossless":
         return _zstandard().compress(image, asbytes=True)
-    packed = io.BytesIO()
-    Image.fromarray(image).save(packed, "JPEG", quality=quality)
-    return packed.getvalue()
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "JPEG", quality=quality)
+    return buffer.getvalue()
 
 
 def decode(packed: bytes, codec: Images, shape: tuple[int, ...], dtype: np.dtype) -> Array:
@@ -64,14 +64,14 @@ def in_threads(work: Callable[[int], None], count: int) -> None:
     """Call `work` with 0 … `count` - 1, on one thread per core; an error is raised once all threads have ended."""
     threads, pool = _threads()
 
-    def share(first: int) -> None:
-        for number in range(first, count, threads):
+    def work_share(start: int) -> None:
+        for number in range(start, count, threads):
             work(number)
 
-    pending = [pool.submit(share, first) for first in range(min(threads, count))]
-    wait(pending)
-    for each in pending:
-        each.result()
+    futures = [pool.submit(work_share, start) for start in range(min(threads, count))]
+    wait(futures)
+    for future in futures:
+        future.result()
 
 
 @cache

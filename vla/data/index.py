@@ -94,13 +94,13 @@ def recording_of(seed: int, draws: Mapping[str, Any]) -> int:
 
 def index_line(entry: Entry) -> bytes:
     """Encode an entry as a line of the index."""
-    return _sealed(dumps(asdict(entry)).encode()) + b"\n"
+    return _seal(dumps(asdict(entry)).encode()) + b"\n"
 
 
 def parse_line(line: bytes, name: str) -> Entry:
     """Decode a line without its line end (UserError: the line is damaged; the message begins with `name`)."""
     body = line.rpartition(CHECK)[0] + b"}"
-    if _sealed(body) != line:
+    if _seal(body) != line:
         raise UserError(f"{name} is damaged: it does not fit its checksum")
     entry = parse_json(body, Entry, name)
     if entry.success and not entry.stored:
@@ -108,16 +108,16 @@ def parse_line(line: bytes, name: str) -> Entry:
     return entry
 
 
-def _sealed(body: bytes) -> bytes:
+def _seal(body: bytes) -> bytes:
     return b"%s%s%d}" % (body[:-1], CHECK, zlib.crc32(body))
 
 
 def dumps(value: Any) -> str:
     """Encode as JSON on one line, with arrays as lists; a UserError for other types than JSON has."""
-    return json.dumps(value, default=_plain, allow_nan=False, ensure_ascii=False)
+    return json.dumps(value, default=_to_plain, allow_nan=False, ensure_ascii=False)
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     if isinstance(value, (np.ndarray, np.generic)):
         return value.tolist()
     raise UserError(f"an episode store keeps numbers, strings, lists and dicts, not {value!r}")
@@ -128,8 +128,8 @@ def listed(numbers: Sequence[int]) -> str:
     ordered = sorted(set(numbers))
     if len(ordered) > 2 and ordered[-1] - ordered[0] == len(ordered) - 1:
         return f"{ordered[0]} to {ordered[-1]}"
-    more = f" and {counted(len(ordered) - MAX_LISTED, 'other')}" if len(ordered) > MAX_LISTED else ""
-    return ", ".join(map(str, ordered[:MAX_LISTED])) + more
+    suffix = f" and {counted(len(ordered) - MAX_LISTED, 'other')}" if len(ordered) > MAX_LISTED else ""
+    return ", ".join(map(str, ordered[:MAX_LISTED])) + suffix
 
 
 def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], int]:
@@ -148,11 +148,11 @@ def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], 
             problems[number] = str(error)
     remedy = REMEDY if any_seed or not entries else SALVAGE
     if damaged and remedy == SALVAGE:
-        return _with_lost(path, entries, len(lines)), 0
+        return _with_lost_entries(path, entries, len(lines)), 0
     if problems:
-        first, *others = problems
-        more = f"; so are the lines {listed(others)}" if others else ""
-        raise UserError(f"{problems[first]}{more}: {remedy}")
+        first_line, *other_lines = problems
+        suffix = f"; so are the lines {listed(other_lines)}" if other_lines else ""
+        raise UserError(f"{problems[first_line]}{suffix}: {remedy}")
     rows, seed = 0, None
     for number, entry in entries.items():
         if entry.start != rows or (entry.seed != seed and seed is not None and not any_seed):
@@ -165,21 +165,21 @@ def _lines(path: Path) -> list[bytes]:
     """Return every complete line, without its line end."""
     *lines, rest = read_bounded(path, MAX_INDEX_BYTES).split(b"\n") if path.exists() else [b""]
     # A process killed within a line leaves a shorter one: here only the line end is damaged.
-    whole = _sealed(rest[:-1].rpartition(CHECK)[0] + b"}") == rest[:-1]
-    return [*lines, rest] if whole else lines
+    is_complete = _seal(rest[:-1].rpartition(CHECK)[0] + b"}") == rest[:-1]
+    return [*lines, rest] if is_complete else lines
 
 
-def _with_lost(path: Path, entries: dict[int, Entry], lines: int) -> list[Entry]:
+def _with_lost_entries(path: Path, entries: dict[int, Entry], lines: int) -> list[Entry]:
     """Return the readable entries with a `LOST` one for every seed between, before and after them that has none."""
-    first, last = min(entries), max(entries)  # numbers of lines
-    oldest, newest = entries[first], entries[last]
-    cut_off = int(first == 1 and oldest.start > 0)  # lines at the start: the first rows belong to a lost entry
-    seeds = range(max(oldest.seed - first + 1 - cut_off, 0), newest.seed + lines - last + 1)
+    first_line, last_line = min(entries), max(entries)  # numbers of lines
+    oldest, newest = entries[first_line], entries[last_line]
+    cut_off = int(first_line == 1 and oldest.start > 0)  # lines at the start: the first rows belong to a lost entry
+    seeds = range(max(oldest.seed - first_line + 1 - cut_off, 0), newest.seed + lines - last_line + 1)
     if len(seeds) > 2 * lines:  # a damaged line end joins two lines, so there are at most two seeds to a line
         raise UserError(f"{path} has too few lines for its seeds, {oldest.seed} to {newest.seed}: {REMEDY}")
-    known = {entry.seed: entry for entry in entries.values()}
-    found, row = list[Entry](), 0
+    entry_by_seed = {entry.seed: entry for entry in entries.values()}
+    all_entries, row = list[Entry](), 0
     for seed in seeds:
-        found.append(known.get(seed, Entry(seed, "", LOST, (), "", row, 0, {}, {})))
-        row = found[-1].end
-    return found
+        all_entries.append(entry_by_seed.get(seed, Entry(seed, "", LOST, (), "", row, 0, {}, {})))
+        row = all_entries[-1].end
+    return all_entries

@@ -38,5 +38,5 @@ class Statistics:
         """
         count = min(len(self.actions), max(MAX_SAMPLE // length, 1))
         rows = np.linspace(0, len(self.actions) - 1, count).round().astype(np.int64)
-        last = self.ends[self.ends.searchsorted(rows, side="right")] - 1
-        return self.actions[np.minimum(rows[:, None] + np.arange(length), last[:, None])]
+        last_rows = self.ends[self.ends.searchsorted(rows, side="right")] - 1
+        return self.actions[np.minimum(rows[:, None] + np.arange(length), last_rows[:, None])]

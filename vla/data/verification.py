@@ -35,18 +35,18 @@ class StoreReport:
     @property
     def outcomes(self) -> dict[str, int]:
         """Outcome → number of tried seeds, the most frequent first."""
-        discarded = [entry for entry in self.store.tried if not entry.stored]
-        known = Counter(entry.outcome for entry in (*self.whole, *discarded))
-        known[DAMAGED] += sum(map(len, self.damaged.values()))
-        solved = known.pop("success", 0)
-        failures = {cause: count for cause, count in known.most_common() if count and cause not in (LOST, NOT_NEEDED)}
-        return {"success": solved, **failures}
+        discarded_entries = [entry for entry in self.store.tried if not entry.stored]
+        counts = Counter(entry.outcome for entry in (*self.whole, *discarded_entries))
+        counts[DAMAGED] += sum(map(len, self.damaged.values()))
+        successes = counts.pop("success", 0)
+        failures = {cause: count for cause, count in counts.most_common() if count and cause not in (LOST, NOT_NEEDED)}
+        return {"success": successes, **failures}
 
     @property
     def success_rate(self) -> float:
         """Share of the solved seeds among those of known outcome, 0…1."""
-        known = sum(self.outcomes.values()) - self.outcomes.get(DAMAGED, 0)
-        return self.outcomes["success"] / known if known else 0.0
+        total = sum(self.outcomes.values()) - self.outcomes.get(DAMAGED, 0)
+        return self.outcomes["success"] / total if total else 0.0
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -57,31 +57,31 @@ class StoreReport:
 def verify_store(store: EpisodeStore) -> StoreReport:
     """Verify checksums, index lines and finite numbers of every episode of a store that may be damaged."""
     entries_by_config(store)  # raises an error if lines are missing
-    damaged: dict[str, list[int]] = {}
-    whole, actions = [], []
-    if lost := [entry.seed for entry in store.tried if entry.outcome == LOST]:
-        damaged["no readable line in the index"] = lost
+    seeds_by_damage: dict[str, list[int]] = {}
+    whole_episodes, actions = [], []
+    if lost_seeds := [entry.seed for entry in store.tried if entry.outcome == LOST]:
+        seeds_by_damage["no readable line in the index"] = lost_seeds
     for entry in track(store.episodes, description="verifying"):
         try:
             rows = _finite_rows(store, entry)
         except DamageError as damage:
-            damaged.setdefault(damage.what, []).append(entry.seed)
+            seeds_by_damage.setdefault(damage.what, []).append(entry.seed)
             continue
-        whole.append(entry)
+        whole_episodes.append(entry)
         actions.append(rows["action"])
-    none = np.empty((0, len(store.spec.action)), np.float32)
-    return StoreReport(store, whole, damaged, np.concatenate([none, *actions]))
+    no_actions = np.empty((0, len(store.spec.action)), np.float32)
+    return StoreReport(store, whole_episodes, seeds_by_damage, np.concatenate([no_actions, *actions]))
 
 
 def require_whole(report: StoreReport) -> None:
     """Raise a UserError if a store has damaged episodes or none."""
     folder, count = report.store.folder, sum(map(len, report.damaged.values()))
     if report.damaged:
-        problems = [f"{counted(len(seeds), 'seed')}, {listed(seeds)}: {what}" for what, seeds in report.damaged.items()]
-        more = [f"and {counted(len(problems) - MAX_LISTED, 'other')}"] if len(problems) > MAX_LISTED else []
-        named = "; ".join([*problems[:MAX_LISTED], *more])
+        problems = [f"{counted(len(seeds), 'seed')}, {listed(seeds)}: {kind}" for kind, seeds in report.damaged.items()]
+        rest = [f"and {counted(len(problems) - MAX_LISTED, 'other')}"] if len(problems) > MAX_LISTED else []
+        summary = "; ".join([*problems[:MAX_LISTED], *rest])
         raise UserError(
-            f"{folder} has {counted(count, 'damaged episode')} ({named}): inspect.repair=true copies what is whole"
+            f"{folder} has {counted(count, 'damaged episode')} ({summary}): inspect.repair=true copies what is whole"
         )
     report.store.require_episodes()
 
@@ -89,20 +89,20 @@ def require_whole(report: StoreReport) -> None:
 def find_episode(store: EpisodeStore, seed: int) -> tuple[dict[str, Any], Episode]:
     """Return the config and the episode of a seed (UserError: the seed was not tried, failed or occurs twice, or its
     episode is damaged)."""
-    tried = [(config, entry) for config, entries in entries_by_config(store) for entry in entries if entry.seed == seed]
-    stored = [(config, entry) for config, entry in tried if entry.stored]
-    if not tried:
+    pairs = [(config, entry) for config, entries in entries_by_config(store) for entry in entries if entry.seed == seed]
+    stored_pairs = [(config, entry) for config, entry in pairs if entry.stored]
+    if not pairs:
         seeds = listed([entry.seed for entry in store.tried]) or "none yet"
         raise UserError(f"{store.folder} has no seed {seed}: it holds {seeds}")
-    if not stored:
-        seeds, outcome = listed([entry.seed for entry in store.episodes]) or "none", tried[0][1].outcome
+    if not stored_pairs:
+        seeds, outcome = listed([entry.seed for entry in store.episodes]) or "none", pairs[0][1].outcome
         raise UserError(
             f"seed {seed} in {store.folder} ended as {outcome}, and its steps were not kept; seeds with steps: {seeds}"
         )
-    if len(stored) > 1:
-        count = f"{store.folder} has {len(stored)} episodes of seed {seed}"
-        raise UserError(f"{count}: inspect one of the stores that it was merged from")
-    config, entry = stored[0]
+    if len(stored_pairs) > 1:
+        problem = f"{store.folder} has {len(stored_pairs)} episodes of seed {seed}"
+        raise UserError(f"{problem}: inspect one of the stores that it was merged from")
+    config, entry = stored_pairs[0]
     return config, episode_of(store, entry)
 
 

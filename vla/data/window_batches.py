@@ -28,9 +28,9 @@ def perturbed(action: Array, executed: Array, spec: Spec) -> Array:
 
     Later labels react to a perturbation that a policy cannot predict, so the loss masks them.
     """
-    least = SHARE_OF_RANGE * (np.array(spec.high) - np.array(spec.low))
-    off = np.abs(executed - action) > np.maximum(SHARE_OF_LABEL * np.abs(action), least)
-    return np.any(off, axis=1)
+    tolerance = SHARE_OF_RANGE * (np.array(spec.high) - np.array(spec.low))
+    deviations = np.abs(executed - action) > np.maximum(SHARE_OF_LABEL * np.abs(action), tolerance)
+    return np.any(deviations, axis=1)
 
 
 class BufferPool:
@@ -76,26 +76,26 @@ class WindowBatcher:
         self, store: EpisodeStore, history: int, chunk: int, pin: bool = False, spec: Spec | None = None
     ) -> None:
         self._pin, self._buffers = pin, BufferPool()
-        self._ages, self._aheads = np.arange(1 - history, 1), np.arange(chunk)
+        self._frame_offsets, self._label_offsets = np.arange(1 - history, 1), np.arange(chunk)
         self._images = {camera: store.rows(f"rgb_{camera}", True) for camera in store.spec.cameras}
         # Two arrays, of frames and of labels: the row look-up costs more than the copy of a few numbers.
         names = ("state", *(("truth",) if store.spec.truth else ()))
         numbers = {name: store.rows(name) for name in (*names, "action", "executed")}
         store.verify(store.episodes, numbers)
         self._size, self._truth_size = (spec or store.spec).image_size, (spec or store.spec).truth_size
-        known = [numbers[name][:] for name in names]
+        columns = [numbers[name][:] for name in names]
         # NaN in place of truth that other stores have but this one lacks.
-        unknown = np.full((len(known[0]), self._truth_size - store.spec.truth_size), np.nan, np.float32)
-        self._numbers = np.concatenate([*known, unknown], axis=1)
+        missing_truth = np.full((len(columns[0]), self._truth_size - store.spec.truth_size), np.nan, np.float32)
+        self._numbers = np.concatenate([*columns, missing_truth], axis=1)
         label, executed = numbers["action"][:], numbers["executed"][:]
         self._actions, self._action_size = np.concatenate([label, executed], axis=1), label.shape[1]
-        off = perturbed(label, executed, store.spec)
-        self._perturbations = np.append(0, off.cumsum())  # before each row
+        perturbed_rows = perturbed(label, executed, store.spec)
+        self._perturbations = np.append(0, perturbed_rows.cumsum())  # before each row
         self._store, self._entries = store, (entries := store.episodes)
         self._verified = np.zeros(len(entries), bool)  # images only
         self._instructions = [entry.instruction for entry in entries]
-        self._first = np.array([entry.start for entry in entries])
-        self._last = np.array([entry.end - 1 for entry in entries])
+        self._first_rows = np.array([entry.start for entry in entries])
+        self._last_rows = np.array([entry.end - 1 for entry in entries])
 
     def __call__(self, windows: Array) -> Batch:
         """Return the batch of `windows` (B,), row numbers (UserError: images of these episodes differ from their
@@ -106,31 +106,31 @@ class WindowBatcher:
         the last action. The valid labels of a frame therefore come first. `perturbations` (B, T, k): perturbed steps
         between a frame and each label, -1 beyond the episode.
         """
-        episode = self._first.searchsorted(windows, side="right") - 1  # (B,)
+        episode = self._first_rows.searchsorted(windows, side="right") - 1  # (B,)
         if not self._verified[episode].all():
             self.verify(np.unique(episode[~self._verified[episode]]))
-        first, last = self._first[episode, None], self._last[episode, None]
-        frames = windows[:, None] + self._ages  # (B, T)
-        labels = frames[:, :, None] + self._aheads  # (B, T, k)
-        present = frames >= first
-        inside = (labels <= last[:, :, None]) & present[:, :, None]
-        labels = np.minimum(np.maximum(labels, first[:, :, None]), last[:, :, None])
-        frames = np.maximum(frames, first)
-        before = self._perturbations[labels] - self._perturbations[frames][:, :, None]
+        first_rows, last_rows = self._first_rows[episode, None], self._last_rows[episode, None]
+        frames = windows[:, None] + self._frame_offsets  # (B, T)
+        labels = frames[:, :, None] + self._label_offsets  # (B, T, k)
+        present = frames >= first_rows
+        inside = (labels <= last_rows[:, :, None]) & present[:, :, None]
+        labels = np.minimum(np.maximum(labels, first_rows[:, :, None]), last_rows[:, :, None])
+        frames = np.maximum(frames, first_rows)
+        perturbations = self._perturbations[labels] - self._perturbations[frames][:, :, None]
         absent = None if present.all() else ~present
-        images = {camera: self._take(rows, frames, absent) for camera, rows in self._images.items()}
-        batch: Batch = {"rgb": {camera: self._own(fitted(each, self._size, "crop")) for camera, each in images.items()}}
+        images = {name: self._take(rows, frames, absent) for name, rows in self._images.items()}
+        batch: Batch = {"rgb": {name: self._stage(fitted(image, self._size, "crop")) for name, image in images.items()}}
         numbers = self._take(self._numbers, frames, absent)
         state = self._numbers.shape[1] - self._truth_size
-        batch["state"] = self._own(numbers[..., :state])
+        batch["state"] = self._stage(numbers[..., :state])
         if self._truth_size:
-            batch["truth"] = self._own(numbers[..., state:])
+            batch["truth"] = self._stage(numbers[..., state:])
         actions = self._take(self._actions, labels)
-        batch["action"] = self._own(actions[..., : self._action_size])
-        batch["executed"] = self._own(actions[..., self._action_size :])
-        batch["present"] = self._own(torch.from_numpy(present))
-        batch["valid"] = self._own(torch.from_numpy(inside & (before == 0)))
-        batch["perturbations"] = self._own(torch.from_numpy(np.where(inside, before, -1)))
+        batch["action"] = self._stage(actions[..., : self._action_size])
+        batch["executed"] = self._stage(actions[..., self._action_size :])
+        batch["present"] = self._stage(torch.from_numpy(present))
+        batch["valid"] = self._stage(torch.from_numpy(inside & (perturbations == 0)))
+        batch["perturbations"] = self._stage(torch.from_numpy(np.where(inside, perturbations, -1)))
         batch["instruction"] = [self._instructions[number] for number in episode.tolist()]
         return batch
 
@@ -156,17 +156,17 @@ class WindowBatcher:
             return torch.empty(shape, dtype=dtype, pin_memory=True).numpy()
         return self._buffers.empty(shape, dtype)
 
-    def _own(self, tensor: torch.Tensor) -> torch.Tensor:
+    def _stage(self, tensor: torch.Tensor) -> torch.Tensor:
         """Return a tensor, for a GPU page-locked and contiguous: a strided one would be copied elsewhere first."""
         return tensor.contiguous().pin_memory() if self._pin else tensor
 
 
 def joined(parts: Sequence[Any]) -> Any:
     """Concatenate batches, that is, mappings of tensors, lists and mappings."""
-    first = parts[0]
-    if isinstance(first, dict):
-        return {name: joined([part[name] for part in parts]) for name in first}
-    if isinstance(first, list):
+    sample = parts[0]
+    if isinstance(sample, dict):
+        return {name: joined([part[name] for part in parts]) for name in sample}
+    if isinstance(sample, list):
         return [item for part in parts for item in part]
-    whole = torch.cat(list(parts))
-    return whole.pin_memory() if first.is_pinned() else whole
+    tensor = torch.cat(list(parts))
+    return tensor.pin_memory() if sample.is_pinned() else tensor

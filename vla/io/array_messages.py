@@ -43,8 +43,8 @@ def unpack(data: bytes) -> Any:
     try:
         return msgpack.unpackb(data, object_hook=budget.take_map, list_hook=budget.take_list, **bounds)
     except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as error:
-        what = str(error)[:200] or type(error).__name__
-        raise UserError(f"the message cannot be read as msgpack with arrays of numbers: {what}") from error
+        reason = str(error)[:200] or type(error).__name__
+        raise UserError(f"the message cannot be read as msgpack with arrays of numbers: {reason}") from error
 
 
 class _Budget:
@@ -69,12 +69,12 @@ class _Budget:
 
 
 def _encode(value: Any) -> Any:
-    kind = getattr(value, "dtype", None)
-    if kind is None or kind.str not in DTYPES:
-        raise TypeError(f"cannot send {type(value).__name__} {kind or ''}")
+    dtype = getattr(value, "dtype", None)
+    if dtype is None or dtype.str not in DTYPES:
+        raise TypeError(f"cannot send {type(value).__name__} {dtype or ''}")
     if isinstance(value, np.ndarray):
-        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": kind.str, b"shape": value.shape}
-    return {b"__npgeneric__": True, b"data": value.item(), b"dtype": kind.str}
+        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": dtype.str, b"shape": value.shape}
+    return {b"__npgeneric__": True, b"data": value.item(), b"dtype": dtype.str}
 
 
 def _array(values: dict[Any, Any]) -> np.ndarray:

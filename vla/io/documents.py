@@ -51,10 +51,10 @@ def read_yaml(path: Path, kind: type[T]) -> T:
 def parse_json(text: str | bytes, kind: type[T], name: str) -> T:
     """Parse JSON text, called `name` in errors, as a `kind`, see `read_json`."""
     try:
-        validated: T = _adapter(cast(Any, kind)).validate_json(text, strict=True)
+        value: T = _adapter(cast(Any, kind)).validate_json(text, strict=True)
     except ValidationError as error:
         raise UserError(f"{name} is damaged or of another kind: {problems(error)}") from error
-    return validated
+    return value
 
 
 def parse_plain(value: Any, kind: type[T], name: str) -> T:
@@ -74,13 +74,13 @@ def lines_of(error: BaseException) -> list[str]:
 def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
     """Parse YAML text, called `name` in errors, as a `kind`, see `read_yaml`."""
     try:
-        shallow = _is_shallow(text)
-        plain = json.dumps(yaml.load(text, Loader=yaml.CSafeLoader) if shallow else None)
+        is_shallow = _is_shallow(text)
+        json_text = json.dumps(yaml.load(text, Loader=yaml.CSafeLoader) if is_shallow else None)
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:  # ValueError: also an impossible date
         raise UserError(f"{name} is no plain YAML: {' '.join(str(error).split())[:200]}") from error
-    if not shallow:
+    if not is_shallow:
         raise UserError(f"{name} is nested deeper than {MAX_DEPTH} levels, or has aliases or numbers of 100 digits")
-    return parse_json(plain, kind, name)
+    return parse_json(json_text, kind, name)
 
 
 def _is_shallow(text: str | bytes) -> bool:
@@ -88,8 +88,8 @@ def _is_shallow(text: str | bytes) -> bool:
     depth = 0
     for event in yaml.parse(text, Loader=yaml.CSafeLoader):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        long = isinstance(event, yaml.ScalarEvent) and LONG_NUMBER.fullmatch(event.value)
-        if depth > MAX_DEPTH or long or isinstance(event, yaml.AliasEvent):
+        is_long_number = isinstance(event, yaml.ScalarEvent) and LONG_NUMBER.fullmatch(event.value)
+        if depth > MAX_DEPTH or is_long_number or isinstance(event, yaml.AliasEvent):
             return False
     return True
 
@@ -104,15 +104,15 @@ def resolved(value: Any, name: str) -> Any:
     # Exact types, because a checkpoint's pickle can make a mapping whose methods hide what it holds.
     count = itertools.count(1)
 
-    def copied(item: Any, depth: int) -> Any:
+    def copy_of(item: Any, depth: int) -> Any:
         if next(count) > MAX_VALUES or depth > MAX_DEPTH:  # a file can refer to a list many times, or to itself
             raise UserError(f"{name} holds more than {MAX_VALUES} values, or more than {MAX_DEPTH} levels of them")
         if type(item) in (list, tuple):
-            return [copied(part, depth + 1) for part in item]
+            return [copy_of(part, depth + 1) for part in item]
         if type(item) is dict:
-            if other := [key for key in item if type(key) is not str]:
-                raise UserError(f"{name} holds the key {str(other[0])[:200]}, which is no text")
-            return {copied(key, depth + 1): copied(part, depth + 1) for key, part in item.items()}
+            if other_keys := [key for key in item if type(key) is not str]:
+                raise UserError(f"{name} holds the key {str(other_keys[0])[:200]}, which is no text")
+            return {copy_of(key, depth + 1): copy_of(part, depth + 1) for key, part in item.items()}
         if type(item) is str and "${" in item:
             raise UserError(f"{name} holds the reference {item[:200]!r}: only resolved values are read from files")
         if item is not None and type(item) not in (bool, int, float, str):
@@ -121,7 +121,7 @@ def resolved(value: Any, name: str) -> Any:
             raise UserError(f"{name} holds {item}, which is not finite")
         return item
 
-    return copied(value, 0)
+    return copy_of(value, 0)
 
 
 def read_resolved(path: Path) -> Any:
@@ -130,14 +130,14 @@ def read_resolved(path: Path) -> Any:
     Also raises a UserError if a key occurs twice, or a text has a lone surrogate, which could not be written again.
     """
 
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(found := dict(pairs)) < len(pairs):
+    def unique_mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(mapping := dict(pairs)) < len(pairs):
             raise UserError("a mapping has one key twice")
-        return found
+        return mapping
 
     try:
         text = read_bounded(path, MAX_RESOLVED_BYTES)
-        value = json.loads(text, object_pairs_hook=unique, parse_constant=int)  # int("NaN") raises a ValueError
+        value = json.loads(text, object_pairs_hook=unique_mapping, parse_constant=int)  # int("NaN") raises a ValueError
         json.dumps(value, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is damaged or of another kind: {str(error)[:200]}") from error
@@ -163,12 +163,12 @@ def canonical(value: Any) -> Any:
 
 def problems(error: ValidationError) -> str:
     """Format the first three validation errors, as `spec.cameras[0]: Input should be a valid string`."""
-    found = [f"{_dotted(each['loc'])}{each['msg']}" for each in error.errors(include_url=False, include_input=False)]
-    more = f"; and {len(found) - 3} more" if len(found) > 3 else ""
-    return "; ".join(found[:3]) + more
+    messages = [f"{_prefix(item['loc'])}{item['msg']}" for item in error.errors(include_url=False, include_input=False)]
+    suffix = f"; and {len(messages) - 3} more" if len(messages) > 3 else ""
+    return "; ".join(messages[:3]) + suffix
 
 
-def _dotted(location: tuple[int | str, ...]) -> str:
+def _prefix(location: tuple[int | str, ...]) -> str:
     path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
     return f"{path.lstrip('.')[:100]}: " if path else ""
 

@@ -20,5 +20,5 @@ def counted(number: int, noun: str) -> str:
 
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Return `, did you mean …?`, or an empty string without a similar name."""
-    close = get_close_matches(name, list(known), n=1)
-    return f", did you mean {close[0]}?" if close else ""
+    matches = get_close_matches(name, list(known), n=1)
+    return f", did you mean {matches[0]}?" if matches else ""

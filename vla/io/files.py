@@ -37,17 +37,17 @@ def atomic_path(target: Path) -> Iterator[Path]:
     # Not the id of this process: in containers, a killed process or one of another machine may have had the same.
     # The suffix is kept, because libraries choose the format by it.
     draft = target.with_name(f".{secrets.token_hex(4)}.{target.name}")
-    before = draft.with_name(f"{draft.name}.before")
+    backup = draft.with_name(f"{draft.name}.before")
     try:
         with writing(target):
             yield draft
             if draft.is_dir() and target.is_dir():
-                os.replace(target, before)
+                os.replace(target, backup)
             os.replace(draft, target)
     finally:
-        if before.is_dir() and not target.exists():
-            os.replace(before, target)
-        for folder in (draft, before):
+        if backup.is_dir() and not target.exists():
+            os.replace(backup, target)
+        for folder in (draft, backup):
             shutil.rmtree(folder, ignore_errors=True)
         with suppress(OSError):  # where nothing can be written, nothing can be removed either
             draft.unlink()
@@ -96,9 +96,9 @@ def writing(target: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno not in UNWRITABLE:
             raise
-        kept = ", and the earlier one is kept" if target.is_file() else ""
+        note = ", and the earlier one is kept" if target.is_file() else ""
         raise OSError(
-            f"{target} cannot be written ({error.strerror}){kept}: make room there, or choose another folder"
+            f"{target} cannot be written ({error.strerror}){note}: make room there, or choose another folder"
         ) from error
 
 

@@ -41,9 +41,9 @@ def fitted(images: Tensor, size: tuple[int, int], fit: Fit) -> Tensor:
     rows, columns = height, width  # of the result that show the images
     if fit == "crop":
         scale = min(shape[0] / height, shape[1] / width)
-        kept = max(round(scale * height), 1), max(round(scale * width), 1)
-        top, left = ((whole - part) // 2 for whole, part in zip(shape, kept, strict=True))
-        x = x[:, :, top : top + kept[0], left : left + kept[1]]
+        crop = max(round(scale * height), 1), max(round(scale * width), 1)
+        top, left = ((whole - part) // 2 for whole, part in zip(shape, crop, strict=True))
+        x = x[:, :, top : top + crop[0], left : left + crop[1]]
     elif fit == "pad":
         scale = min(height / shape[0], width / shape[1])
         rows, columns = max(round(scale * shape[0]), 1), max(round(scale * shape[1]), 1)
@@ -73,10 +73,10 @@ def decode_image(content: bytes, size: tuple[int, int] | None = None) -> Array:
     try:
         with Image.open(io.BytesIO(content), formats=FORMATS) as image:
             height, width = image.height, image.width
-            wanted = size or (height, width)
-            if image.mode not in MODES or (height, width) != wanted or height * width > MOST_PIXELS:
-                asked = f"{f'{size[0]} x {size[1]}, ' if size else ''}at most {MOST_PIXELS}, of {', '.join(MODES)}"
-                raise UserError(f"the image is {height} x {width} pixels of {image.mode}, and must be {asked}")
+            expected_size = size or (height, width)
+            if image.mode not in MODES or (height, width) != expected_size or height * width > MOST_PIXELS:
+                limits = f"{f'{size[0]} x {size[1]}, ' if size else ''}at most {MOST_PIXELS}, of {', '.join(MODES)}"
+                raise UserError(f"the image is {height} x {width} pixels of {image.mode}, and must be {limits}")
             return np.array(image.convert("RGB"))
     except UnidentifiedImageError as error:  # its text contains a memory address
         raise UserError(f"the image cannot be decoded: it is not {' or '.join(FORMATS)}") from error

@@ -66,8 +66,8 @@ class Part:
             yield f"the window of {self.camera} is {self.window}, not top, left, bottom and right within the picture"
         if not self.point and max(bottom, right) > 1:
             yield f"the window of {self.camera} ends outside the picture"
-        if unknown := [name for name in self.point if name not in state]:
-            yield f"the part of {self.camera} moves with {', '.join(unknown)}, which is not in the state"
+        if unknown_names := [name for name in self.point if name not in state]:
+            yield f"the part of {self.camera} moves with {', '.join(unknown_names)}, which is not in the state"
         if (len(self.point), len(self.offset), len(self.projection)) not in ((0, 0, 0), (3, 3, 12)):
             yield f"the part of {self.camera} needs 3 names in point, 3 numbers in offset, 12 in projection, or none"
 

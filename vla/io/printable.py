@@ -16,7 +16,7 @@ HIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e
 
 def printable(text: str) -> str:
     r"""Return a text with hidden characters as escapes, such as \x1b."""
-    return HIDDEN.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+    return HIDDEN.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
 
 
 class Formatter(logging.Formatter):
@@ -38,7 +38,7 @@ def show(renderable: Any) -> None:
     from rich.segment import Segment, Segments
 
     console = get_console()
-    parts = [each if each.control else Segment(printable(each.text), each.style) for each in console.render(renderable)]
+    parts = [part if part.control else Segment(printable(part.text), part.style) for part in console.render(renderable)]
     console.print(Segments(parts), end="")
 
 

@@ -26,15 +26,15 @@ class Bar(Progress):
         columns = (TextColumn(label), BarColumn(bar_width=None), count, TextColumn("{task.description}"))
         # Painting takes milliseconds, in a thread that the work waits for.
         super().__init__(*columns, TimeRemainingColumn(), refresh_per_second=4)
-        self._label, self._said = label, time.monotonic()
+        self._label, self._logged_at = label, time.monotonic()
         self.add_task(note, total=total, completed=done)
 
     def show(self, done: int, note: str = "") -> None:
         """Show that `done` items are completed, with a note."""
         (task,) = self.tasks
         self.update(task.id, completed=done, description=note)
-        if time.monotonic() - self._said >= EVERY and not self.console.is_terminal:
-            self._said, left = time.monotonic(), task.time_remaining
-            of = "" if task.total is None else f" of {task.total:.0f}"
-            time_left = "" if left is None else f"{timedelta(seconds=round(left))} left"
-            log.info("%s", ", ".join(filter(None, (f"{self._label}: {done}{of}", note, time_left))))
+        if time.monotonic() - self._logged_at >= EVERY and not self.console.is_terminal:
+            self._logged_at, seconds_left = time.monotonic(), task.time_remaining
+            total = "" if task.total is None else f" of {task.total:.0f}"
+            time_left = "" if seconds_left is None else f"{timedelta(seconds=round(seconds_left))} left"
+            log.info("%s", ", ".join(filter(None, (f"{self._label}: {done}{total}", note, time_left))))

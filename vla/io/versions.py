@@ -11,13 +11,13 @@ from importlib.metadata import PackageNotFoundError, distributions, version
 @cache  # reading all metadata takes a third of a second
 def installed_versions() -> dict[str, str]:
     """Return name → version of vla, of packages that require it, and of the requirements of these, if installed."""
-    listed = set[str]()
-    for each in distributions():
-        names = {each.name, *(re.split(r"[^\w.-]", text)[0] for text in each.requires or ())}
-        if "vla" in names and each.name:  # an interrupted installation leaves nameless ones
-            listed |= names
-    found = dict[str, str]()
-    for name in sorted(listed):
+    requirements = set[str]()
+    for package in distributions():
+        names = {package.name, *(re.split(r"[^\w.-]", text)[0] for text in package.requires or ())}
+        if "vla" in names and package.name:  # an interrupted installation leaves nameless ones
+            requirements |= names
+    versions = dict[str, str]()
+    for name in sorted(requirements):
         with suppress(PackageNotFoundError):
-            found[name] = version(name) or "unknown"
-    return found
+            versions[name] = version(name) or "unknown"
+    return versions

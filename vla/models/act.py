@@ -46,11 +46,11 @@ class CVAEEncoder(nn.Module):
 
         Inputs: the (B, robot_state_width) state, if it is used, (B, k, D) scaled actions and their (B, k) bool mask.
         """
-        before = self.start.weight.expand(len(action), 1, -1)
+        prefix = self.start.weight.expand(len(action), 1, -1)
         if robot_state is not None:
-            before = torch.cat([before, self.robot_state(robot_state).unsqueeze(1)], 1)
-        tokens = torch.cat([before, self.action(action)], 1)
-        padding = torch.cat([valid.new_zeros(before.shape[:2]), ~valid], 1)
+            prefix = torch.cat([prefix, self.robot_state(robot_state).unsqueeze(1)], 1)
+        tokens = torch.cat([prefix, self.action(action)], 1)
+        padding = torch.cat([valid.new_zeros(prefix.shape[:2]), ~valid], 1)
         hidden = self.encoder(tokens + self.positions.weight, src_key_padding_mask=padding)[:, 0]
         mean, log_variance = self.head(hidden).chunk(2, -1)
         return mean, log_variance

@@ -58,19 +58,19 @@ class Guided(Chunking):
         """Return the guided velocity."""
         place = torch.arange(running.actions.shape[1], device=running.actions.device)
         start, end = running.delay.unsqueeze(1), running.remaining.unsqueeze(1)
-        falling = (1 - (place - start + 1) / (end - start + 1)).clamp(0, 1).unsqueeze(-1)  # (B, k, 1)
-        weights = falling if self._decay == "linear" else falling * falling.expm1() / (math.e - 1)
+        ramp = (1 - (place - start + 1) / (end - start + 1)).clamp(0, 1).unsqueeze(-1)  # (B, k, 1)
+        weights = ramp if self._decay == "linear" else ramp * ramp.expm1() / (math.e - 1)
 
-        def guided(noisy: Tensor, time: Tensor) -> Tensor:
+        def guided_velocity(noisy: Tensor, time: Tensor) -> Tensor:
             t = time[:, None, None]
-            made = torch.func.vjp(lambda noisy: velocity(noisy, time), noisy) if self._jacobian else None
-            free = made[0] if made else velocity(noisy, time)
-            error = weights * (running.actions - (noisy + (1 - t) * free))
-            correction = error + (1 - t) * made[1](error)[0] if made else error  # ∂A/∂a is 1 + (1 - t) ∂v/∂a
+            vjp = torch.func.vjp(lambda noisy: velocity(noisy, time), noisy) if self._jacobian else None
+            free_velocity = vjp[0] if vjp else velocity(noisy, time)
+            error = weights * (running.actions - (noisy + (1 - t) * free_velocity))
+            correction = error + (1 - t) * vjp[1](error)[0] if vjp else error  # ∂A/∂a is 1 + (1 - t) ∂v/∂a
             factor = ((t**2 + (1 - t) ** 2) / (t * (1 - t))).clamp(max=self._limit)
-            return free + factor * correction
+            return free_velocity + factor * correction
 
-        return guided
+        return guided_velocity
 
 
 class TrainedPrefix(Chunking):
@@ -83,8 +83,8 @@ class TrainedPrefix(Chunking):
 
 def with_prefix(noisy: Tensor, time: Tensor, clean: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
     """Replace the first (B,) `length` of (B, k, D) noisy actions by clean ones, and return them with (B, k) times."""
-    known = torch.arange(noisy.shape[1], device=noisy.device) < length.unsqueeze(1)
-    return torch.where(known.unsqueeze(-1), clean, noisy), time.unsqueeze(1).masked_fill(known, 1.0)
+    mask = torch.arange(noisy.shape[1], device=noisy.device) < length.unsqueeze(1)
+    return torch.where(mask.unsqueeze(-1), clean, noisy), time.unsqueeze(1).masked_fill(mask, 1.0)
 
 
 def after_prefix(perturbations: Tensor, length: Tensor) -> Tensor:
@@ -94,21 +94,21 @@ def after_prefix(perturbations: Tensor, length: Tensor) -> Tensor:
     the prefix and the label was. `perturbations` (B, k): perturbed steps before each label, -1 beyond the episode.
     """
     place = torch.arange(perturbations.shape[1], device=length.device)
-    before = perturbations.gather(1, length.unsqueeze(1))
-    return (place >= length.unsqueeze(1)) & (perturbations == before) & (perturbations >= 0)
+    prefix_perturbations = perturbations.gather(1, length.unsqueeze(1))
+    return (place >= length.unsqueeze(1)) & (perturbations == prefix_perturbations) & (perturbations >= 0)
 
 
 def require_chunking(method: type, model: type, prefix: int) -> None:
     """Raise a UserError unless models of a class, trained with prefixes up to a length, can continue plans."""
     if not getattr(model, "continues", False):
-        why = (
+        reason = (
             f"continues the plans of flow models, and {model.__name__} is none: omit it, or choose model=flow or a VLA"
         )
     elif issubclass(method, TrainedPrefix) and not prefix:
-        why = "needs a model trained with prefixes: train with model.prefix=4, or choose +policy/chunking=guided"
+        reason = "needs a model trained with prefixes: train with model.prefix=4, or choose +policy/chunking=guided"
     else:
         return
-    raise UserError(f"+policy/chunking ({method.__name__}) {why}")
+    raise UserError(f"+policy/chunking ({method.__name__}) {reason}")
 
 
 def require_prefix(prefix: int, execute: int, chunk: int) -> None:

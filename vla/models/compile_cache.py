@@ -18,8 +18,8 @@ def set_compile_cache() -> None:
     """
     from torch._inductor.runtime.cache_dir_utils import default_cache_dir  # heavy, and needed only to compile
 
-    shared = default_cache_dir()
-    if os.environ.get(CACHE_VARIABLE, shared) == shared:
+    default_folder = default_cache_dir()
+    if os.environ.get(CACHE_VARIABLE, default_folder) == default_folder:
         features = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
         kind = (torch.backends.cpu.get_cpu_capability(), os.environ.get("ONEDNN_MAX_CPU_ISA"), features)
-        os.environ[CACHE_VARIABLE] = f"{shared}_{crc32(repr(kind).encode()):08x}"
+        os.environ[CACHE_VARIABLE] = f"{default_folder}_{crc32(repr(kind).encode()):08x}"

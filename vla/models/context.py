@@ -189,11 +189,11 @@ class TokenContext(Context):
         cameras, frames = len(self.spec.cameras), batch["present"].shape[1]
         # One pass of the encoder for all cameras.
         images = pixels(torch.cat([batch["rgb"][camera] for camera in self.spec.cameras]))
-        every = self.image(images, text.repeat(cameras, 1).repeat_interleave(frames, 0))  # (cameras·B·T, C, h, w)
+        maps = self.image(images, text.repeat(cameras, 1).repeat_interleave(frames, 0))  # (cameras·B·T, C, h, w)
         tokens = []
-        for index, features in enumerate(every.chunk(cameras)):  # (B·T, C, h, w) each
-            learned = self.image_tokens(self.token_learners[index](features))
-            tokens.append(learned.unflatten(0, (-1, frames)))  # (B, T, learned_tokens, E)
+        for index, features in enumerate(maps.chunk(cameras)):  # (B·T, C, h, w) each
+            image_tokens = self.image_tokens(self.token_learners[index](features))
+            tokens.append(image_tokens.unflatten(0, (-1, frames)))  # (B, T, learned_tokens, E)
             if self.keypoints is not None:
                 positions = self.keypoint_tokens[index](self.keypoints[index](features).flatten(1))
                 tokens.append(positions.view(-1, frames, 1, positions.shape[-1]))
@@ -226,18 +226,18 @@ class Fusion(nn.Module):
         self.positions = nn.Embedding(history * per_frame, width)
         nn.init.normal_(self.positions.weight, std=0.05)
         self.instruction = nn.Linear(text_width, width)
-        first = [nn.Linear((per_frame + 1) * width, 2 * width), nn.ReLU()]
-        second = [nn.Linear(2 * width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width)]
-        self.mlp = nn.Sequential(*first, *second)
+        input_layers = [nn.Linear((per_frame + 1) * width, 2 * width), nn.ReLU()]
+        output_layers = [nn.Linear(2 * width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width)]
+        self.mlp = nn.Sequential(*input_layers, *output_layers)
         self.norm = nn.LayerNorm(width)
 
     def forward(self, frames: Tensor, text: Tensor) -> Tensor:
         """Map (B, T, n, E) frames, the newest last, and (B, text_width) text to (B, T·n + 2, E)."""
-        visual = frames.flatten(1, 2)
-        visual = visual + self.positions.weight[-visual.shape[1] :]
+        frame_tokens = frames.flatten(1, 2)
+        frame_tokens = frame_tokens + self.positions.weight[-frame_tokens.shape[1] :]
         instruction = self.instruction(text).unsqueeze(1)
-        fused = self.mlp(torch.cat([frames[:, -1], instruction], 1).flatten(1)).unsqueeze(1)
-        return self.norm(torch.cat([visual, instruction, fused], 1))
+        summary = self.mlp(torch.cat([frames[:, -1], instruction], 1).flatten(1)).unsqueeze(1)
+        return self.norm(torch.cat([frame_tokens, instruction, summary], 1))
 
 
 def newest_last(frames: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:

@@ -45,18 +45,18 @@ class CachedLayer:
         return x + layer.linear2(layer.activation(hidden))
 
 
-def _project(attention: nn.MultiheadAttention, x: Tensor, first: int, last: int) -> list[Tensor]:
-    """Project (B, L, E) to queries 0, keys 1, values 2 from `first` up to `last`, (B, heads, L, E / heads) each."""
-    rows = slice(first * attention.embed_dim, last * attention.embed_dim)
+def _project(attention: nn.MultiheadAttention, x: Tensor, start: int, stop: int) -> list[Tensor]:
+    """Project (B, L, E) to queries 0, keys 1, values 2 from `start` up to `stop`, (B, heads, L, E / heads) each."""
+    rows = slice(start * attention.embed_dim, stop * attention.embed_dim)
     projected = F.linear(x, attention.in_proj_weight[rows], attention.in_proj_bias[rows])
-    return list(projected.unflatten(-1, (last - first, attention.num_heads, -1)).permute(2, 0, 3, 1, 4))
+    return list(projected.unflatten(-1, (stop - start, attention.num_heads, -1)).permute(2, 0, 3, 1, 4))
 
 
 def _attend(
     attention: nn.MultiheadAttention, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None = None
 ) -> Tensor:
-    attended = F.scaled_dot_product_attention(query, key, value, mask)
-    return attention.out_proj(attended.transpose(1, 2).flatten(2))
+    output = F.scaled_dot_product_attention(query, key, value, mask)
+    return attention.out_proj(output.transpose(1, 2).flatten(2))
 
 
 class Decoder(ContextModel):

@@ -126,18 +126,18 @@ class DenoisingModel(ContextModel):
         action = self.scaled(batch["action"][:, -1]).repeat(self.copies, 1, 1)  # (R·B, k, D)
         context = output["context"].repeat(self.copies, 1, 1)
         padding = output["padding"].repeat(self.copies, 1) if "padding" in output else None
-        how = random_arguments(self.training, action.device)
-        noise = torch.randn(action.shape, **how).to(action)
-        uniform = torch.rand(len(action), **how).to(action)
+        options = random_arguments(self.training, action.device)
+        noise = torch.randn(action.shape, **options).to(action)
+        uniform = torch.rand(len(action), **options).to(action)
         noisy, time, target = self.corrupt(action, noise, uniform)
-        counted = batch["valid"][:, -1].repeat(self.copies, 1)
+        mask = batch["valid"][:, -1].repeat(self.copies, 1)
         if self.prefix:
             executed = self.scaled(batch["executed"][:, -1]).repeat(self.copies, 1, 1)
-            length = torch.randint(self.prefix + 1, (len(action),), **how).to(time.device)
+            length = torch.randint(self.prefix + 1, (len(action),), **options).to(time.device)
             noisy, time = with_prefix(noisy, time, executed, length)
-            counted = after_prefix(batch["perturbations"][:, -1].repeat(self.copies, 1), length)
+            mask = after_prefix(batch["perturbations"][:, -1].repeat(self.copies, 1), length)
         error = (self.denoiser(noisy, time, context, padding).float() - target).square()
-        return {"action_loss": mean_where(error.mean(-1), counted)}
+        return {"action_loss": mean_where(error.mean(-1), mask)}
 
     def predict(self, batch: Batch) -> Prediction:
         """Denoise the "noise" of the batch, or else a fixed noise."""

@@ -37,20 +37,20 @@ def shard(model: nn.Module, mesh: DeviceMesh) -> None:
 
 def reshard(model: nn.Module) -> None:
     """Free gathered weights, so that each process holds only its own shards."""
-    for part in _sharded(model):
+    for part in _sharded_parts(model):
         part.reshard()
 
 
 @contextmanager
 def unsharded(model: nn.Module) -> Iterator[None]:
     """Gather all weights in every process, for calls that bypass `forward`; the weights must not be changed."""
-    for part in _sharded(model):
+    for part in _sharded_parts(model):
         part.unshard()
     yield
     reshard(model)
 
 
-def _sharded(model: nn.Module) -> Iterator[FSDPModule]:
+def _sharded_parts(model: nn.Module) -> Iterator[FSDPModule]:
     from torch.distributed.fsdp import FSDPModule
 
     return (part for part in model.modules() if isinstance(part, FSDPModule))

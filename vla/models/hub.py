@@ -25,10 +25,10 @@ def fetch(name: str, *patterns: str, advice: str = "") -> Path:
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 
-    reason, (repository, _, revision) = _unreachable(), name.removeprefix(HUB).partition("@")
+    reason, (repository, _, revision) = _connection_problem(), name.removeprefix(HUB).partition("@")
     try:
-        cached = {"local_files_only": reason is not None}
-        return Path(snapshot_download(repository, revision=revision or None, allow_patterns=list(patterns), **cached))
+        options = {"local_files_only": reason is not None}
+        return Path(snapshot_download(repository, revision=revision or None, allow_patterns=list(patterns), **options))
     except (HfHubHTTPError, HFValidationError, OSError) as error:
         if isinstance(error, HFValidationError):
             reason = "models are called OWNER/NAME there"
@@ -39,7 +39,7 @@ def fetch(name: str, *patterns: str, advice: str = "") -> Path:
         raise UserError(f"{name} cannot be fetched from the Hugging Face hub: {reason}{advice}") from error
 
 
-def _unreachable() -> str | None:
+def _connection_problem() -> str | None:
     """Return why the hub is unreachable, or None; without this check a download would wait without a timeout."""
     from huggingface_hub import constants, get_session
 

@@ -50,16 +50,16 @@ class RunningNormalizer(nn.Module):
         return normalized * present.unsqueeze(-1)
 
     def _update(self, values: Tensor, weight: Tensor) -> None:
-        added = _sum_over_processes(weight.sum())
-        total = (self.count + added).clamp(min=1)
-        mean = _sum_over_processes((values * weight).sum((0, 1))) / added.clamp(min=1)
+        batch_count = _sum_over_processes(weight.sum())
+        total = (self.count + batch_count).clamp(min=1)
+        mean = _sum_over_processes((values * weight).sum((0, 1))) / batch_count.clamp(min=1)
         squares = _sum_over_processes(((values - mean).square() * weight).sum((0, 1)))
         # Parallel variance algorithm (Chan et al. 1979).
         shift = mean - self.mean
-        between = shift.square() * self.count * added / total
-        self.variance.copy_((self.variance * self.count + squares + between) / total)
-        self.mean.add_(shift * added / total)
-        self.count.add_(added)
+        correction = shift.square() * self.count * batch_count / total
+        self.variance.copy_((self.variance * self.count + squares + correction) / total)
+        self.mean.add_(shift * batch_count / total)
+        self.count.add_(batch_count)
 
 
 def _sum_over_processes(tensor: Tensor) -> Tensor:
@@ -105,9 +105,9 @@ def pixels(images: Tensor) -> Tensor:
 
 def mlp(inputs: int, width: int) -> nn.Sequential:
     """Build an MLP of three layers from `inputs` to `width` features, with layer normalisation and GELU."""
-    first = [nn.Linear(inputs, width), nn.LayerNorm(width), nn.GELU()]
-    second = [nn.Linear(width, width), nn.LayerNorm(width), nn.GELU()]
-    return nn.Sequential(*first, *second, nn.Linear(width, width), nn.GELU())
+    input_layers = [nn.Linear(inputs, width), nn.LayerNorm(width), nn.GELU()]
+    hidden_layers = [nn.Linear(width, width), nn.LayerNorm(width), nn.GELU()]
+    return nn.Sequential(*input_layers, *hidden_layers, nn.Linear(width, width), nn.GELU())
 
 
 def transformer_encoder(width: int, layers: int, heads: int) -> nn.Module:

@@ -74,7 +74,7 @@ class Learner(LightningModule):
         self.model, self._spec, self._config = model, spec, config
         self._lr, self._weight_decay, self._warmup, self._schedule = lr, weight_decay, warmup_steps, schedule
         self._compile, self._rates, self._frozen = compile, rates or {}, frozen
-        self._before: tuple[bool, str] | None = None  # flash attention and precision outside training
+        self._saved_precision: tuple[bool, str] | None = None  # flash attention and precision outside training
         self._non_finite_step: Tensor | None = None  # () on the device of the loss
         self.errors = nn.ModuleList(MeanMetric() for _ in spec.action)
         self._scale = lora.scale if lora else 1.0
@@ -102,7 +102,7 @@ class Learner(LightningModule):
 
     def on_fit_start(self) -> None:
         """Disable flash attention on a CPU, as its bfloat16 backward is very slow; enable TensorFloat-32 on a GPU."""
-        self._before = torch.backends.cuda.flash_sdp_enabled(), torch.get_float32_matmul_precision()
+        self._saved_precision = torch.backends.cuda.flash_sdp_enabled(), torch.get_float32_matmul_precision()
         if self.device.type == "cpu":
             torch.backends.cuda.enable_flash_sdp(False)
         else:
@@ -110,9 +110,9 @@ class Learner(LightningModule):
 
     def teardown(self, stage: str) -> None:
         """Undo what `on_fit_start` set, so that an evaluation in this process gives the same results as in another."""
-        if self._before is not None:
-            _set_precision(*self._before)
-            self._before = None
+        if self._saved_precision is not None:
+            _set_precision(*self._saved_precision)
+            self._saved_precision = None
 
     def configure_callbacks(self) -> list[Callback]:
         """Return a callback that calls `teardown` after an error, when Lightning does not but a sweep continues."""
@@ -121,14 +121,14 @@ class Learner(LightningModule):
     @contextmanager
     def evaluating(self) -> Iterator[None]:
         """Within the context, compute exactly what a process that does not train would: see `on_fit_start`."""
-        during = torch.backends.cuda.flash_sdp_enabled(), torch.get_float32_matmul_precision()
-        if self._before is not None:
-            _set_precision(*self._before)
+        training_precision = torch.backends.cuda.flash_sdp_enabled(), torch.get_float32_matmul_precision()
+        if self._saved_precision is not None:
+            _set_precision(*self._saved_precision)
         try:
             with torch.compiler.set_stance("force_eager"):  # compiled for another shape than that of one window
                 yield
         finally:
-            _set_precision(*during)
+            _set_precision(*training_precision)
 
     @torch.no_grad()
     def on_train_start(self) -> None:
@@ -157,8 +157,8 @@ class Learner(LightningModule):
         if self._schedule == "constant":
             return 1.0
         total = float(self.trainer.estimated_stepping_batches)  # infinite without a limit of steps
-        done = (step - self._warmup) / max(total - self._warmup, 1)
-        return 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
+        progress = (step - self._warmup) / max(total - self._warmup, 1)
+        return 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
 
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
         """Apply the transforms of the model to a batch on its device."""
@@ -172,8 +172,8 @@ class Learner(LightningModule):
         """
         losses = self.model.loss(self.model.augment(batch))
         self._record_finite(losses["loss"].detach())
-        every = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
-        if every and (self.global_step + 1) % every == 0:  # only when loggers write
+        interval = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if interval and (self.global_step + 1) % interval == 0:  # only when loggers write
             for name, value in losses.items():
                 self.log(f"train/{name}", value.detach())
         return losses["loss"]
@@ -227,9 +227,9 @@ class Learner(LightningModule):
         checkpoint["config"], checkpoint["spec"] = self._config, self._spec.to_dict()
         checkpoint["trunks"] = {name: asdict(source) for name, source in self._trunks.items()}
         checkpoint["lora_scale"] = self._scale
-        measured = self.trainer.callback_metrics.items()
-        found = {name: float(value) for name, value in measured if name.startswith("val/")}
-        checkpoint["figures"] = self._figures = found or self._figures
+        metrics = self.trainer.callback_metrics.items()
+        figures = {name: float(value) for name, value in metrics if name.startswith("val/")}
+        checkpoint["figures"] = self._figures = figures or self._figures
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restore the figures of the last validation, for a policy that is saved before the next one."""

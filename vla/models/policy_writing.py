@@ -57,7 +57,7 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
     config, spec = content["config"], content["spec"]
     names = (*files.REQUIRED_NODES, *files.OPTIONAL_NODES, "seed", "pretrained")
     nodes = {name: config[name] for name in names if name in config}
-    nodes["model"] = _located(nodes["model"])
+    nodes["model"] = _with_absolute_paths(nodes["model"])
     validate = config.get("validate") or {}
     # The data module saves the digest of the demonstrations under a key with the name of its class, unknown here.
     states = [part for part in content.values() if isinstance(part, dict)]
@@ -70,8 +70,8 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
         if isinstance(value, Tensor)
     }
     # One string, because safetensors writes several in random order, and equal policies must have equal digests.
-    further = json.dumps({name: value for name, value in state.items() if name not in tensors})
-    weights = save(tensors, {files.FURTHER: further})
+    further_state = json.dumps({name: value for name, value in state.items() if name not in tensors})
+    weights = save(tensors, {files.FURTHER: further_state})
     training = files.Training(
         steps=content["global_step"],
         windows=next((part["windows"] for part in states if isinstance(part.get("windows"), str)), ""),
@@ -90,20 +90,20 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
         for name, part in ((files.CONFIG, nodes), (files.SPEC, spec), (files.TRAINING, asdict(training))):
             write_json(draft / name, part)
         (draft / files.CARD).write_text(_card(nodes, spec, training, count), encoding="utf-8")
-        for file in draft.iterdir():
-            with file.open("rb") as written:
-                os.fsync(written.fileno())
+        for path in draft.iterdir():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
 
 
-def _located(model: Mapping[str, Any]) -> dict[str, Any]:
+def _with_absolute_paths(model: Mapping[str, Any]) -> dict[str, Any]:
     """Return the node of a model with absolute paths of weights, files or folders, valid in any working directory."""
-    located = copy.deepcopy({**model})
-    encoders = ((node, "pretrained", Path.is_file) for node in mappings(located))
-    parts = [(located, "trunk", Path.is_dir), (located.get("text"), "name", Path.is_dir), *encoders]
+    model_copy = copy.deepcopy({**model})
+    encoders = ((node, "pretrained", Path.is_file) for node in mappings(model_copy))
+    parts = [(model_copy, "trunk", Path.is_dir), (model_copy.get("text"), "name", Path.is_dir), *encoders]
     for node, key, is_there in parts:
         if isinstance(node, dict) and isinstance(name := node.get(key), str) and is_there(Path(name)):
             node[key] = str(Path(name).absolute())  # links are not resolved: the suffix of their name tells the format
-    return located
+    return model_copy
 
 
 def _card(config: Mapping[str, Any], spec: Mapping[str, Any], training: files.Training, count: int) -> str:

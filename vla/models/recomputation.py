@@ -30,19 +30,19 @@ def recompute_layers(model: nn.Module) -> None:
     if not layers:
         raise UserError(f"learner.checkpointing=true finds no layers to recompute in {type(model).__name__}: omit it")
     for layer in layers:
-        layer.forward = partial(_computed_again, layer.forward)
+        layer.forward = partial(_recompute, layer.forward)
 
 
 def _layers(module: nn.Module) -> Iterator[nn.Module]:
     """Yield the innermost layers."""
     for child in module.children():
-        inner, weights = list(_layers(child)), dict(child.named_parameters())
+        inner_layers, weights = list(_layers(child)), dict(child.named_parameters())
         composed = any("." in name for name in weights) and child.state_dict().keys() == weights.keys()
         large = sum(weight.numel() for weight in weights.values()) >= MIN_PARAMETERS
-        yield from inner or ([child] if isinstance(module, LISTS) and composed and large else [])
+        yield from inner_layers or ([child] if isinstance(module, LISTS) and composed and large else [])
 
 
-def _computed_again(forward: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+def _recompute(forward: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
     if not torch.is_grad_enabled():
-        return forward(*arguments, **named)
-    return checkpoint(forward, *arguments, use_reentrant=False, **named)
+        return forward(*arguments, **keywords)
+    return checkpoint(forward, *arguments, use_reentrant=False, **keywords)

@@ -40,11 +40,11 @@ class Layer(nn.Module):
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Map (B, L, E) to the same shape; position i attends to j if the (L, L) bool mask[i, j] is true."""
-        split = self.query_key_value(self.attention_norm(x)).unflatten(-1, (3, self.heads, -1))
-        query, key, value = split.permute(2, 0, 3, 1, 4)  # (B, heads, L, key_width) each
+        projections = self.query_key_value(self.attention_norm(x)).unflatten(-1, (3, self.heads, -1))
+        query, key, value = projections.permute(2, 0, 3, 1, 4)  # (B, heads, L, key_width) each
         dropout = self.dropout if self.training else 0.0
-        attended = F.scaled_dot_product_attention(query, key, value, mask, dropout)
-        x = x + self.output(attended.transpose(1, 2).flatten(2))
+        attention = F.scaled_dot_product_attention(query, key, value, mask, dropout)
+        x = x + self.output(attention.transpose(1, 2).flatten(2))
         return x + F.dropout(self.linear(self.linear_norm(x)), self.dropout, self.training)
 
 
@@ -97,14 +97,14 @@ class RT1(ContextModel, TokenModel):
         """
         frames = batch["tokens"] if "tokens" in batch else self.encode(batch)
         present = batch["present"] if "present" in batch else frames.new_ones(frames.shape[:2], dtype=torch.bool)
-        tokens, back = oldest_first(frames, present)
-        empty = tokens.new_zeros(*tokens.shape[:2], self.slots, tokens.shape[-1])
-        hidden = self.transform(torch.cat([tokens, empty], 2).flatten(1, 2))
+        tokens, inverse_order = oldest_first(frames, present)
+        empty_slots = tokens.new_zeros(*tokens.shape[:2], self.slots, tokens.shape[-1])
+        hidden = self.transform(torch.cat([tokens, empty_slots], 2).flatten(1, 2))
         hidden = hidden.unflatten(1, (tokens.shape[1], -1))  # (B, T, N + A, E)
-        before_slots = hidden[:, :, self.context.per_frame - 1 : -1]  # (B, T, A, E)
-        before_slots = before_slots.gather(1, back[:, :, None, None].expand_as(before_slots))
-        logits = self.head(before_slots).unflatten(2, self.logits_shape[:2])
-        return {"logits": logits, **self.predict_truth(before_slots[:, :, 0])}
+        slot_states = hidden[:, :, self.context.per_frame - 1 : -1]  # (B, T, A, E)
+        slot_states = slot_states.gather(1, inverse_order[:, :, None, None].expand_as(slot_states))
+        logits = self.head(slot_states).unflatten(2, self.logits_shape[:2])
+        return {"logits": logits, **self.predict_truth(slot_states[:, :, 0])}
 
     def transform(self, sequence: Tensor) -> Tensor:
         """Apply the transformer to (B, L, E) tokens, the first L of a window; same shape."""
@@ -118,9 +118,9 @@ class RT1(ContextModel, TokenModel):
 def oldest_first(frames: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     """Roll (B, T, N, E) frames until the oldest present one is first, -, 1, 2 → 1, 2, -; also return (B, T) places that
     undo it. A policy's first frames have these positions too, in which none attends to absent frames."""
-    steps, first = torch.arange(present.shape[1], device=present.device), present.int().argmax(1, keepdim=True)
-    rolled, back = ((steps + shift) % present.shape[1] for shift in (first, -first))
-    return frames.gather(1, rolled[:, :, None, None].expand_as(frames)), back
+    steps, offset = torch.arange(present.shape[1], device=present.device), present.int().argmax(1, keepdim=True)
+    order, inverse_order = ((steps + shift) % present.shape[1] for shift in (offset, -offset))
+    return frames.gather(1, order[:, :, None, None].expand_as(frames)), inverse_order
 
 
 def attention_mask(frames: int, tokens: int, slots: int) -> Tensor:

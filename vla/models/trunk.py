@@ -50,15 +50,15 @@ def is_factor(name: str) -> bool:
 
 def trunks(model: nn.Module) -> dict[str, Source]:
     """Return name → source of the parts whose weights were loaded from elsewhere and are not trained."""
-    found = dict[str, Source]()
+    sources = dict[str, Source]()
     for name, module in model.named_modules():
         part = name.removesuffix(".base_layer")  # a linear map with LoRA factors is called as without them
         source = getattr(module, "source", None)
-        if not isinstance(source, Source) or is_within(part, found):
+        if not isinstance(source, Source) or is_within(part, sources):
             continue
-        if not any(weight.requires_grad and not is_factor(each) for each, weight in module.named_parameters()):
-            found[part] = source
-    return found
+        if not any(weight.requires_grad and not is_factor(key) for key, weight in module.named_parameters()):
+            sources[part] = source
+    return sources
 
 
 def evaluate_frozen(module: nn.Module) -> None:
@@ -76,9 +76,9 @@ def require_trunks(model: nn.Module, named: Mapping[str, Source], policy: object
     """
     modules: dict[str, Any] = dict(model.named_modules())
     for part, source in named.items():
-        if (found := getattr(modules.get(part), "source", None)) is None or found.sha256 != source.sha256:
-            here = f"here it is {found}" if found else "that is not here"
-            raise UserError(f"{policy} was trained with {part} from {source}, and {here}: get the one of the training")
+        if (model_source := getattr(modules.get(part), "source", None)) is None or model_source.sha256 != source.sha256:
+            text = f"here it is {model_source}" if model_source else "that is not here"
+            raise UserError(f"{policy} was trained with {part} from {source}, and {text}: get the one of the training")
 
 
 def whole_state(model: nn.Module, state: Mapping[str, Any], named: Collection[str]) -> dict[str, Any]:
@@ -86,17 +86,17 @@ def whole_state(model: nn.Module, state: Mapping[str, Any], named: Collection[st
 
     The attribute `source` becomes None on every module whose weights in this state differ from those of its source.
     """
-    whole = {name: value for name, value in state.items() if not (is_factor(name) and is_within(name, named))}
-    changed = set[str]()  # linear maps
+    result = {name: value for name, value in state.items() if not (is_factor(name) and is_within(name, named))}
+    changed_layers = set[str]()  # linear maps
     for part in named:
         for name, value in model.get_submodule(part).state_dict(prefix=f"{part}.").items():
             layer = name.removesuffix(".weight")
             if f"{layer}.lora_A" in state:
                 value = value + state[f"{layer}.lora_B"] @ state[f"{layer}.lora_A"]
-                changed.add(layer)
-            whole[name] = value
+                changed_layers.add(layer)
+            result[name] = value
     for name, module in model.named_modules():
-        unchanged = is_within(name, named) and not any(is_within(layer, [name]) for layer in changed)
+        unchanged = is_within(name, named) and not any(is_within(layer, [name]) for layer in changed_layers)
         if isinstance(getattr(module, "source", None), Source) and not unchanged:
             module.source = None  # type: ignore[assignment]
-    return whole
+    return result

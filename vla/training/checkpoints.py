@@ -40,26 +40,26 @@ class GracefulStop(Checkpoint):
     """
 
     def __init__(self, checkpoints: Path) -> None:
-        self._path, self._previous_seconds, self._began = checkpoints / LAST, 0.0, time.monotonic()
+        self._path, self._previous_seconds, self._start_time = checkpoints / LAST, 0.0, time.monotonic()
         self.requested = self.stopped = self.started = self._signalled = self._step_complete = False
 
     @property
     def seconds(self) -> float:
         """Return the training time so far, including resumed runs [s]."""
-        return self._previous_seconds + time.monotonic() - self._began
+        return self._previous_seconds + time.monotonic() - self._start_time
 
     @contextmanager
     def handling_signals(self) -> Iterator[None]:
         """Handle the signals, if in the main thread, and start the clock."""
-        self._began = time.monotonic()
+        self._start_time = time.monotonic()
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        previous = self._install_handlers()
+        previous_handlers = self._install_handlers()
         try:
             yield
         finally:
-            for number, handler in previous.items():
+            for number, handler in previous_handlers.items():
                 signal.signal(number, handler)
 
     def _install_handlers(self) -> dict[signal.Signals, Any]:
@@ -82,8 +82,8 @@ class GracefulStop(Checkpoint):
     ) -> None:
         """Save and stop as due, unless gradients are being accumulated or a validation follows."""
         self._step_complete = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
-        every = trainer.val_check_batch  # counted from the start of the training
-        validates = trainer.enable_validation and every and (trainer.fit_loop.total_batch_idx + 1) % every == 0
+        interval = trainer.val_check_batch  # counted from the start of the training
+        validates = trainer.enable_validation and interval and (trainer.fit_loop.total_batch_idx + 1) % interval == 0
         if not validates:
             self.on_validation_end(trainer, pl_module)
 
@@ -123,8 +123,8 @@ class GracefulStop(Checkpoint):
         except Exception as error:
             if self.started or checkpoint is None:
                 raise
-            what = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-            raise UserError(f"{checkpoint} cannot be resumed: {what[:1000]}") from error
+            reason = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            raise UserError(f"{checkpoint} cannot be resumed: {reason[:1000]}") from error
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):

@@ -79,7 +79,7 @@ class ClosedLoop(Callback):
         self._make_player = partial(_Player, make_environment, make_policy)
         self._pool: ProcessPool | None = None
         self._path = run / BEST
-        self._plays = self._played = False
+        self._enabled = self._played = False
         self.success, self.best = 0.0, -1.0
 
     def __enter__(self) -> ClosedLoop:
@@ -95,8 +95,8 @@ class ClosedLoop(Callback):
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Build the environment before training, in case this machine cannot."""
         assert isinstance(pl_module, Learner)
-        self._plays = pl_module.device_mesh is None and trainer.enable_validation
-        if self._plays:
+        self._enabled = pl_module.device_mesh is None and trainer.enable_validation
+        if self._enabled:
             environment = self._make_environment()
             environment.close()
             pl_module.model.spec.require_input(environment.spec, "the demonstrations", "the task")
@@ -104,21 +104,21 @@ class ClosedLoop(Callback):
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Play the episodes; later callbacks restore the weights in training."""
         assert isinstance(pl_module, Learner)
-        if not self._plays:
+        if not self._enabled:
             return
-        mine = self._seeds[trainer.global_rank :: trainer.world_size]
+        seeds = self._seeds[trainer.global_rank :: trainer.world_size]
         workers = self._workers * trainer.num_nodes // trainer.world_size
-        results = self.play(pl_module, mine, min(workers, len(mine) // PER_WORKER))
+        results = self.play(pl_module, seeds, min(workers, len(seeds) // PER_WORKER))
         for result in results:
             if result.error:
                 log.warning("validation: seed %d could not be played: %s", result.seed, result.error)
         counts = [sum(result.success for result in results), sum(not result.error for result in results)]
-        gathered = pl_module.all_gather(torch.tensor(counts, device=pl_module.device))
-        assert isinstance(gathered, torch.Tensor)
-        won, completed = gathered.view(-1, 2).sum(0).tolist()  # of all processes
-        self._played = completed > 0
+        process_counts = pl_module.all_gather(torch.tensor(counts, device=pl_module.device))
+        assert isinstance(process_counts, torch.Tensor)
+        successes, episodes = process_counts.view(-1, 2).sum(0).tolist()  # of all processes
+        self._played = episodes > 0
         if self._played:
-            self.success = won / completed
+            self.success = successes / episodes
             pl_module.log("val/success", self.success, sync_dist=True)
 
     def play(self, learner: Learner, seeds: Sequence[int], workers: int) -> list[Result]:
@@ -136,8 +136,8 @@ class ClosedLoop(Callback):
                 self._pool = ProcessPool(self._make_player, workers).__enter__()
             model = pickle.dumps(learner.model)
             parts = [seeds[worker::workers] for worker in range(workers)]
-            pending = [self._pool.submit((model, part)) for part in parts]
-            return [result for future, part in zip(pending, parts, strict=True) for result in _results(future, part)]
+            futures = [self._pool.submit((model, part)) for part in parts]
+            return [result for future, part in zip(futures, parts, strict=True) for result in _results(future, part)]
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save `policy_best` if episodes were played, and their success rate is at least the best so far."""
@@ -170,8 +170,8 @@ class ClosedLoop(Callback):
 
 def processes_that_fit(device: torch.device, size: float) -> int:
     """Return how many processes have memory for a model of `size` [bytes] on a device, each with a copy of its own."""
-    own = OF_GPU if device.type == "cuda" else 0
-    return int(min(memory_of(device)[1], free_memory()) / (ROOM * size + own))
+    overhead = OF_GPU if device.type == "cuda" else 0
+    return int(min(memory_of(device)[1], free_memory()) / (ROOM * size + overhead))
 
 
 def _results(future: Future, seeds: Sequence[int]) -> list[Result]:

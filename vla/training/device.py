@@ -25,7 +25,7 @@ def memory_of(device: torch.device) -> tuple[float, float]:
     """Return the memory that this process holds, see `peak`, and the memory that is free for it [bytes]."""
     if device.type == "cuda":
         return torch.cuda.memory_allocated(device), torch.cuda.mem_get_info(device)[0]
-    return psutil.Process().memory_info().rss - _of_files(), free_memory()
+    return psutil.Process().memory_info().rss - _file_memory(), free_memory()
 
 
 def peak(device: torch.device) -> float:
@@ -36,7 +36,7 @@ def peak(device: torch.device) -> float:
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    return largest - _of_files()
+    return largest - _file_memory()
 
 
 def reset_peak(device: torch.device) -> None:
@@ -46,6 +46,6 @@ def reset_peak(device: torch.device) -> None:
         Path("/proc/self/clear_refs").write_text("5")
 
 
-def _of_files() -> int:
+def _file_memory() -> int:
     """Return the file-backed memory of this process [bytes]; 0 where it is unknown."""
     return getattr(psutil.Process().memory_info(), "shared", 0)

@@ -29,14 +29,14 @@ class EMA(Callback):
 
     def __init__(self, decay: float) -> None:
         self._decay = decay
-        self._average: list[Tensor] = []  # of `_averaged`; empty before the first step
+        self._average: list[Tensor] = []  # of `_weights_of`; empty before the first step
         self._step = 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Move an average from a checkpoint to the device of the model."""
         self._step = trainer.global_step
-        current = _averaged(pl_module).values()
-        self._average = [mine.to(one.device) for mine, one in zip(self._average, current, strict=False)]
+        weights = _weights_of(pl_module).values()
+        self._average = [average.to(weight.device) for average, weight in zip(self._average, weights, strict=False)]
 
     @torch.no_grad()
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
@@ -45,21 +45,21 @@ class EMA(Callback):
             return
         self._step = trainer.global_step
         if not self._average:
-            self._average = [one.clone() for one in _averaged(pl_module).values()]
+            self._average = [weight.clone() for weight in _weights_of(pl_module).values()]
         elif self._step % EVERY == 0:
-            current = _averaged(pl_module).values()
+            weights = _weights_of(pl_module).values()
             # Bias correction, as for Adam's moments (arXiv 1412.6980, section 3).
             share = (1 - self._decay**EVERY) / (1 - self._decay**self._step)
             # One fused kernel, which cannot mix plain and sharded tensors.
-            torch._foreach_lerp_([*map(local_shard, self._average)], [*map(local_shard, current)], share)
+            torch._foreach_lerp_([*map(local_shard, self._average)], [*map(local_shard, weights)], share)
 
     @torch.no_grad()
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Exchange the average and the weights in training."""
-        for mine, other in zip(self._average, _averaged(pl_module).values(), strict=False):
-            average = mine.clone()
-            mine.copy_(other)
-            other.copy_(average)
+        for average, weight in zip(self._average, _weights_of(pl_module).values(), strict=False):
+            backup = average.clone()
+            average.copy_(weight)
+            weight.copy_(backup)
 
     on_validation_epoch_end = on_validation_epoch_start
 
@@ -67,20 +67,20 @@ class EMA(Callback):
         """Save the average as `state_dict` and the weights in training as `current_model_state`."""
         if not self._average:
             return
-        current = checkpoint["state_dict"]
-        average = {name: full_tensor(one) for name, one in zip(_averaged(pl_module), self._average, strict=True)}
-        checkpoint["current_model_state"] = current
-        checkpoint["state_dict"] = {name: average.get(name, value) for name, value in current.items()}
+        training_state = checkpoint["state_dict"]
+        average = {name: full_tensor(value) for name, value in zip(_weights_of(pl_module), self._average, strict=True)}
+        checkpoint["current_model_state"] = training_state
+        checkpoint["state_dict"] = {name: average.get(name, value) for name, value in training_state.items()}
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """Read the average from the loaded model, then load the weights in training into it."""
-        self._average = [one.detach().clone() for one in _averaged(pl_module).values()]
+        self._average = [weight.detach().clone() for weight in _weights_of(pl_module).values()]
         if "current_model_state" in checkpoint:
             options = StateDictOptions(full_state_dict=True)
             set_model_state_dict(pl_module, checkpoint["current_model_state"], options=options)
 
 
-def _averaged(module: LightningModule) -> dict[str, Tensor]:
+def _weights_of(module: LightningModule) -> dict[str, Tensor]:
     """Return name → trained parameters and floating-point buffers of a module, sharded ones as they are."""
     reshard(module)
     weights = {name: weight for name, weight in module.named_parameters() if weight.requires_grad}

@@ -24,32 +24,32 @@ class Throughput(Callback):
     """
 
     def __init__(self) -> None:
-        self._batches, self._began, self._paused, self._waited = 0, 0.0, 0.0, 0.0
+        self._batches, self._start, self._pause_start, self._initial_waiting = 0, 0.0, 0.0, 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the measurement."""
-        self._batches, self._began, self._waited = 0, time.perf_counter(), _waited(trainer)
+        self._batches, self._start, self._initial_waiting = 0, time.perf_counter(), _waiting_seconds(trainer)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Pause the measurement."""
-        self._paused = time.perf_counter()
+        self._pause_start = time.perf_counter()
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Resume the measurement."""
-        self._began += time.perf_counter() - self._paused
+        self._start += time.perf_counter() - self._pause_start
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Log every `log_every_n_steps` batches."""
         self._batches += 1
-        every = trainer.log_every_n_steps  # type: ignore[attr-defined]
-        if not every or (batch_idx + 1) % every:
+        interval = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if not interval or (batch_idx + 1) % interval:
             return
-        seconds = time.perf_counter() - self._began
+        seconds = time.perf_counter() - self._start
         pace = {
             "pace/samples_per_s": self._batches * trainer.world_size * len(batch["action"]) / seconds,
-            "pace/waiting": (_waited(trainer) - self._waited) / seconds,
+            "pace/waiting": (_waiting_seconds(trainer) - self._initial_waiting) / seconds,
         }
         if pl_module.device.type == "cuda":
             pace["pace/memory_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 1e9
@@ -57,7 +57,7 @@ class Throughput(Callback):
         self.on_train_start(trainer, pl_module)
 
 
-def _waited(trainer: Trainer) -> float:
+def _waiting_seconds(trainer: Trainer) -> float:
     """Return the time spent waiting for batches [s]; 0 for data loaders that do not measure it."""
     return float(getattr(trainer.train_dataloader, "waited", 0.0))
 
@@ -79,7 +79,7 @@ class TrainingProgressBar(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Advance the bar; read the loss every `READ_EVERY` batches."""
-        parts, logged = trainer.accumulate_grad_batches, trainer.callback_metrics
+        parts, metrics = trainer.accumulate_grad_batches, trainer.callback_metrics
         if self._loss is None or batch_idx % self.READ_EVERY == 0:
             self._loss = outputs["loss"].item() * parts  # Lightning divides it by these
         if not trainer.is_global_zero:
@@ -89,12 +89,12 @@ class TrainingProgressBar(Callback):
             self._bar = Bar("training", total, batch_idx)
             self._bar.start()
         notes = [f"loss {self._loss:.3f}"]
-        if "pace/samples_per_s" in logged:
-            notes.append(f"{logged['pace/samples_per_s']:.0f} samples/s")
-        if "val/success" in logged:
-            notes.append(f"success {logged['val/success']:.0%}")
-        if logged.get("pace/waiting", 0) > MUCH:
-            notes.append(f"waiting {logged['pace/waiting']:.0%}")
+        if "pace/samples_per_s" in metrics:
+            notes.append(f"{metrics['pace/samples_per_s']:.0f} samples/s")
+        if "val/success" in metrics:
+            notes.append(f"success {metrics['val/success']:.0%}")
+        if metrics.get("pace/waiting", 0) > MUCH:
+            notes.append(f"waiting {metrics['pace/waiting']:.0%}")
         self._bar.show(batch_idx + 1, ", ".join(notes))
 
     def on_train_end(self, *_: Any) -> None:

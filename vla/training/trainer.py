@@ -93,7 +93,7 @@ def make_trainer(config: Mapping[str, Any], checkpoints: Path, *callbacks: Callb
             StepSeeding(config["seed"]),  # after callbacks that may use random numbers
         ],
         logger=[build(node, "logger", save_dir=str(checkpoints.parent)) for node in loggers],
-        enable_checkpointing=any(isinstance(each, Checkpoint) for each in callbacks),  # else Lightning adds its own
+        enable_checkpointing=any(isinstance(item, Checkpoint) for item in callbacks),  # else Lightning adds its own
         enable_progress_bar=False,
     )
     environment = getattr(trainer.strategy, "cluster_environment", None)
@@ -114,20 +114,20 @@ def _trainer(node: Mapping[str, Any], **options: Any) -> Trainer:
     if node.get("sync_batchnorm"):
         options["plugins"] = [SyncBatchNorm()]
     try:
-        own = {name: value for name, value in node.items() if name != "precision"}
-        trainer: Trainer = build(own, "trainer", **options)
+        arguments = {name: value for name, value in node.items() if name != "precision"}
+        trainer: Trainer = build(arguments, "trainer", **options)
         if isinstance(trainer.strategy, ParallelStrategy) and trainer.strategy.cluster_environment:
             # Compare the number of processes with the cluster now; Lightning would only at the start of training.
             trainer.strategy.cluster_environment.validate_settings(trainer.num_devices, trainer.num_nodes)
     except (MisconfigurationException, RuntimeError, TypeError, ValueError) as error:
         names = ("accelerator", "devices", "num_nodes", "strategy", "precision")
-        chosen = {name: node[name] for name in names if isinstance(node.get(name), str | int | list)}
-        anywhere = chosen.get("accelerator") in ("auto", "cpu") and "strategy" not in node
-        if anywhere and chosen.get("devices") == 1:  # no machine lacks that
+        settings = {name: node[name] for name in names if isinstance(node.get(name), str | int | list)}
+        runs_anywhere = settings.get("accelerator") in ("auto", "cpu") and "strategy" not in node
+        if runs_anywhere and settings.get("devices") == 1:  # no machine lacks that
             raise UserError(f"Lightning refuses the trainer: {error}") from error
-        options_text = " ".join(f"trainer.{name}={value}" for name, value in chosen.items())
-        every_machine = "trainer=auto trainer.accelerator=auto trainer.devices=1"
-        raise UserError(f"{options_text} is not available here ({error}): try {every_machine}") from error
+        options_text = " ".join(f"trainer.{name}={value}" for name, value in settings.items())
+        fallback = "trainer=auto trainer.accelerator=auto trainer.devices=1"
+        raise UserError(f"{options_text} is not available here ({error}): try {fallback}") from error
     return trainer
 
 

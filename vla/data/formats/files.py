@@ -46,9 +46,9 @@ class Files:
         """Write the missing episodes, each atomically; returns the folder (UserError: the folder holds an episode of
         another store, or the store is damaged)."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        with staging_folder(self._folder) as place:
-            missing = [number for number in range(len(store.episodes)) if not self._is_exported(store, number)]
-            deque(map_episodes(partial(self._export, place), store, missing, cluster), 0)
+        with staging_folder(self._folder) as staging:
+            missing_numbers = [number for number in range(len(store.episodes)) if not self._is_exported(store, number)]
+            deque(map_episodes(partial(self._export, staging), store, missing_numbers, cluster), 0)
         return self._folder
 
     def _is_exported(self, store: EpisodeStore, number: int) -> bool:
@@ -60,23 +60,23 @@ class Files:
     def _manifest(self, store: EpisodeStore, number: int) -> dict[str, Any]:
         return provenance(store.episodes[number]) | {"spec": store.spec.to_dict()}
 
-    def _export(self, place: Path, store: EpisodeStore, number: int) -> None:
+    def _export(self, staging: Path, store: EpisodeStore, number: int) -> None:
         entry = store.episodes[number]
-        draft = place / f"episode_{number:05d}"
+        draft = staging / f"episode_{number:05d}"
         shutil.rmtree(draft, ignore_errors=True)  # left by an interrupted export
         spec, rows = store.spec, store.read(entry)
         for step in range(entry.steps):
-            place = draft / f"step_{step:04d}"
+            step_folder = draft / f"step_{step:04d}"
             for camera in spec.cameras:
-                images = place / camera if len(spec.cameras) > 1 else place
-                images.mkdir(parents=True)
-                Image.fromarray(rows[f"rgb_{camera}"][step]).save(images / "rgb_image.png", compress_level=1)
+                image_folder = step_folder / camera if len(spec.cameras) > 1 else step_folder
+                image_folder.mkdir(parents=True)
+                Image.fromarray(rows[f"rgb_{camera}"][step]).save(image_folder / "rgb_image.png", compress_level=1)
                 if camera in spec.depth:
-                    np.save(images / "depth_image.npy", rows[f"depth_{camera}"][step] * MILLIMETRE)
+                    np.save(image_folder / "depth_image.npy", rows[f"depth_{camera}"][step] * MILLIMETRE)
             state = dict(zip(spec.state, rows["state"][step].tolist(), strict=True))
-            write_json(place / "robot_state.json", state)
+            write_json(step_folder / "robot_state.json", state)
             actions = {name: rows[name][step].tolist() for name in ("action", "executed")}
-            write_json(place / "expert_action.json", actions)
+            write_json(step_folder / "expert_action.json", actions)
         write_json(draft / "manifest.json", self._manifest(store, number))
         os.rename(draft, self._folder / draft.name)
 
@@ -95,17 +95,17 @@ def staging_folder(folder: Path) -> Iterator[Path]:
         UserError: another process is exporting to `folder`.
         OSError: the export cannot be written; the message names `folder`.
     """
-    place = folder.with_name(f".{folder.name}.unfinished")
-    place.mkdir(parents=True, exist_ok=True)
-    lock = locked(place / "lock", f"another export to {folder} is under way: wait, or choose another export.folder")
+    staging = folder.with_name(f".{folder.name}.unfinished")
+    staging.mkdir(parents=True, exist_ok=True)
+    lock = locked(staging / "lock", f"another export to {folder} is under way: wait, or choose another export.folder")
     try:
         with writing(folder):
-            yield place
-        shutil.rmtree(place)
+            yield staging
+        shutil.rmtree(staging)
     finally:
         with suppress(OSError):  # removes the folder only if it is empty
-            (place / "lock").unlink()
-            place.rmdir()
+            (staging / "lock").unlink()
+            staging.rmdir()
         lock.release()
 
 
@@ -114,13 +114,13 @@ def map_episodes(
 ) -> Generator[Any]:
     """Yield the results of `work(store, item)` in the order of the items, computed on a cluster (UserError: raised by
     `work` or by the cluster)."""
-    make = partial(_ExportWorker, work, store.folder.resolve(), len(store.episodes))
-    with cluster.pool(make) as pool:
-        pending = deque(map(pool.submit, items))
+    make_worker = partial(_ExportWorker, work, store.folder.resolve(), len(store.episodes))
+    with cluster.pool(make_worker) as pool:
+        futures = deque(map(pool.submit, items))
         try:
-            yield from track((pending.popleft().result() for _ in items), "exporting", len(items))
-        except WorkersLost as lost:
-            raise WorkersLost(f"{lost}; written files are kept, run again to continue") from lost
+            yield from track((futures.popleft().result() for _ in items), "exporting", len(items))
+        except WorkersLost as error:
+            raise WorkersLost(f"{error}; written files are kept, run again to continue") from error
 
 
 class _ExportWorker:

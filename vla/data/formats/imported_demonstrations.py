@@ -75,7 +75,7 @@ class ImportedDemonstrations(ABC):
         """Make an episode from its rows by field, except depth, which is set to 0, and from actions (N, D), clipped."""
         spec = self.spec
         depth = {f"depth_{camera}": np.zeros((len(actions), *spec.image_size), np.uint16) for camera in spec.depth}
-        clipped = self._clipped(actions)
+        clipped_actions = self._clip(actions)
         return Episode(
             seed=number,
             task="recorded",
@@ -84,8 +84,8 @@ class ImportedDemonstrations(ABC):
             milestones=frozenset(),
             draws={"recorded": recorded},
             observations=observations_of(spec, {**rows, **depth}, instruction),
-            actions=clipped,
-            executed=clipped if executed is None else executed,
+            actions=clipped_actions,
+            executed=clipped_actions if executed is None else executed,
         )
 
     def fill(self, store: EpisodeStore, episodes: int) -> int:
@@ -99,21 +99,21 @@ class ImportedDemonstrations(ABC):
             return 0
         store.require_growable()
         with store.writing():  # another process may have added some meanwhile
-            first = store.next_seed or 0
-            if (possible := len(store.episodes) + len(self) - first) < episodes:  # damaged ones are not imported again
-                raise UserError(f"only {counted(possible, 'whole episode')}: set collect.episodes={possible}, or fewer")
-            missing = range(first, first + episodes - len(store.episodes))
-            for number in track(missing, "importing"):
+            next_seed = store.next_seed or 0
+            if (limit := len(store.episodes) + len(self) - next_seed) < episodes:  # damaged ones are not imported again
+                raise UserError(f"only {counted(limit, 'whole episode')}: set collect.episodes={limit}, or fewer")
+            numbers = range(next_seed, next_seed + episodes - len(store.episodes))
+            for number in track(numbers, "importing"):
                 store.append(self.episode(number))
-        return len(missing)
+        return len(numbers)
 
-    def _clipped(self, actions: Array) -> Array:
+    def _clip(self, actions: Array) -> Array:
         return np.clip(actions, self.spec.low, self.spec.high).astype(np.float32)
 
     def require_enough(self, episodes: int) -> None:
         """Raise a UserError if there are fewer than `episodes` recorded episodes."""
-        if episodes > (there := len(self)):
-            raise UserError(f"only {counted(there, 'recorded episode')}: set collect.episodes={there}, or fewer")
+        if episodes > (count := len(self)):
+            raise UserError(f"only {counted(count, 'recorded episode')}: set collect.episodes={count}, or fewer")
 
     def require_held(self, store: EpisodeStore) -> None:
         """Raise a UserError unless the episodes that a store and this recording share are the same but for images."""
@@ -121,10 +121,10 @@ class ImportedDemonstrations(ABC):
         for entry in store.episodes:
             if entry.seed >= len(self):
                 continue
-            words, state, action = self.numbers(entry.seed)
-            action = self._clipped(action)
+            instruction, state, action = self.numbers(entry.seed)
+            action = self._clip(action)
             same = np.array_equal(states[entry.span], state) and np.array_equal(actions[entry.span], action)
-            if entry.instruction != words or not same:
+            if entry.instruction != instruction or not same:
                 raise UserError(
                     f"{store.folder} differs from the recording, first in episode {entry.seed}: delete it if it was "
                     "imported from an earlier version of that, or choose another collect.folder"
@@ -137,26 +137,26 @@ def action_bounds(values: Array) -> tuple[float, float]:
     They are the smallest and the largest value, unless one is an outlier: further from the quantiles than
     `OUTLIER_MARGIN` times the distance between these. A component that hardly moves, such as a gripper, has none.
     """
-    least, most = float(values.min()), float(values.max())
+    lower, upper = float(values.min()), float(values.max())
     low, high = (float(quantile) for quantile in np.quantile(values, OUTLIER_QUANTILES))
-    if high - low > RARE_EVENT_SPREAD * (most - least):
-        least, most = max(least, low - OUTLIER_MARGIN * (high - low)), min(most, high + OUTLIER_MARGIN * (high - low))
-    apart = 1e-3 * max(1.0, abs(least)) if least == most else 0.0
-    return least - apart, most + apart
+    if high - low > RARE_EVENT_SPREAD * (upper - lower):
+        lower, upper = max(lower, low - OUTLIER_MARGIN * (high - low)), min(upper, high + OUTLIER_MARGIN * (high - low))
+    margin = 1e-3 * max(1.0, abs(lower)) if lower == upper else 0.0
+    return lower - margin, upper + margin
 
 
 def out_of_bounds(actions: Array, spec: Spec, most: float) -> list[str]:
     """Describe components that exceed the bounds in more than the share `most` of the (N, D) actions: other units."""
-    found = list[str]()
+    descriptions = list[str]()
     for index, (name, low, high) in enumerate(zip(spec.action, spec.low, spec.high, strict=True)):
         values, slack = actions[:, index], BOUNDS_TOLERANCE * (high - low)
-        if (beyond := ((values < low - slack) | (values > high + slack)).mean()) > most:
+        if (share := ((values < low - slack) | (values > high + slack)).mean()) > most:
             unit = "" if spec.units[index] == "1" else f" {spec.units[index]}"
-            found.append(
-                f"its action {name} is from {values.min():.3g} to {values.max():.3g}, {beyond:.0%} of it beyond the "
+            descriptions.append(
+                f"its action {name} is from {values.min():.3g} to {values.max():.3g}, {share:.0%} of it beyond the "
                 f"bounds of the task, {low:g} to {high:g}{unit} (other units, or absolute?)"
             )
-    return found
+    return descriptions
 
 
 def log_clipped(actions: Array, spec: Spec) -> None:

@@ -72,8 +72,8 @@ class LeRobotDataset:
         keys = [key for key, feature in self.info.features.items() if feature.dtype in IMAGES and not feature.is_depth]
         cameras = [key.removeprefix("observation.").removeprefix("images.") for key in keys]
         self.images = dict(zip(cameras, keys, strict=True) if images is None else images)
-        if unknown := [key for key in self.images.values() if key not in keys]:
-            raise UserError(f"expert.images: {folder} has no images {', '.join(unknown)}, it has {', '.join(keys)}")
+        if extra_keys := [key for key in self.images.values() if key not in keys]:
+            raise UserError(f"expert.images: {folder} has no images {', '.join(extra_keys)}, it has {', '.join(keys)}")
         self.parts = self._read_parts([key for key in self.images.values() if self._is_video(key)])
 
     def components(
@@ -93,14 +93,14 @@ class LeRobotDataset:
             if (size := features[key].shape[0]) > MAX_COMPONENTS:
                 raise UserError(f"{self.folder} has {size} components in {key}, the limit is {MAX_COMPONENTS}")
         places = [(key, index) for key in keys for index in range(features[key].shape[0])]
-        numbered = [f"{key.rpartition('.')[2]}_{index}" for key, index in places]
+        numbered_names = [f"{key.rpartition('.')[2]}_{index}" for key, index in places]
         if in_order and len(places) == len(anonymous):
             return dict(zip(anonymous, places, strict=True))
         if not any(features[key].components for key in keys):
-            by_number = len(places) != len(anonymous) or {*numbered} >= {*anonymous}
-            return dict(zip(numbered if by_number else anonymous, places, strict=True))
-        named = {(key, index): name for key in keys for index, name in enumerate(features[key].components)}
-        names = [named.get(place, number) for place, number in zip(places, numbered, strict=True)]
+            by_number = len(places) != len(anonymous) or {*numbered_names} >= {*anonymous}
+            return dict(zip(numbered_names if by_number else anonymous, places, strict=True))
+        names_by_place = {(key, index): name for key in keys for index, name in enumerate(features[key].components)}
+        names = [names_by_place.get(place, default) for place, default in zip(places, numbered_names, strict=True)]
         if len(set(names)) < len(names):
             names = [f"{key}.{name}" for (key, _), name in zip(places, names, strict=True)]
         if len(set(names)) < len(names):  # within a feature, such as those of two arms
@@ -110,7 +110,7 @@ class LeRobotDataset:
     def read(self, keys: Sequence[str]) -> dict[str, Array]:
         """Read features, each (N, D) float32, in the order of the tables; a UserError if one holds no such numbers."""
         rows = tables.read(tables.files(self.folder / "data"), dict.fromkeys(keys, NUMBERS) | {OWNER: COUNTS})
-        found = dict[str, Array]()
+        arrays = dict[str, Array]()
         for key in keys:
             size = self.info.features[key].shape[0]
             values = tables.vectors(rows[key], size)
@@ -120,8 +120,8 @@ class LeRobotDataset:
                     f"{MEND}"
                 )
             self._require_finite(key, values, rows[OWNER].to_numpy())
-            found[key] = values
-        return found
+            arrays[key] = values
+        return arrays
 
     def require_images(self, cameras: Sequence[str]) -> None:
         """Require the images of cameras; decodes the first one of each camera alone (UserError: a file is missing or
@@ -131,11 +131,11 @@ class LeRobotDataset:
         for path in tables.files(self.folder / "data"):
             tables.require(path, {key: PICTURES for key in images if not self._is_video(key)})
         for key in images:
-            next(self._decoded(self.parts[0], key, 1))
+            next(self._decode_images(self.parts[0], key, 1))
 
     def frames(self, part: Part, camera: str, size: tuple[int, int], every: int) -> Array:
         """Return every `every`-th image of a part, (N, H, W, 3) uint8, cropped at the centre and resized to `size`."""
-        images = self._decoded(part, self.images[camera], every)
+        images = self._decode_images(part, self.images[camera], every)
         return np.stack([resize(image, size) for image in images])
 
     def _read_parts(self, videos: Sequence[str]) -> list[Part]:
@@ -150,23 +150,23 @@ class LeRobotDataset:
             raise UserError(f"{self.folder}/data has rows of {TIME} that are not one number: {MEND}")
         self._require_finite(TIME, stamps, owner)
         order, numbers = np.argsort(owner, kind="stable"), [row[OWNER] for row in episodes]
-        first, stop = (np.searchsorted(owner[order], numbers, side) for side in ("left", "right"))
+        starts, ends = (np.searchsorted(owner[order], numbers, side) for side in ("left", "right"))
         parts = list[Part]()
-        for row, start, end in zip(episodes, first, stop, strict=True):
+        for row, start, end in zip(episodes, starts, ends, strict=True):
             steps, number = order[start:end], row[OWNER]
             times = stamps[steps, 0]
             if len(steps) != (count := row[TO] - row[FROM]) or not count:
-                found, remedy = f"{len(steps)} steps of episode {number}", REMEDY if len(steps) < count else MEND
-                raise UserError(f"{self.folder}/data holds {found}, and meta/episodes counts {count}: {remedy}")
+                content, remedy = f"{len(steps)} steps of episode {number}", REMEDY if len(steps) < count else MEND
+                raise UserError(f"{self.folder}/data holds {content}, and meta/episodes counts {count}: {remedy}")
             self._require_even(number, times - times[0])
-            files = tuple(paths[each] for each in np.unique(file[steps]))
+            files = tuple(paths[index] for index in np.unique(file[steps]))
             # Actions after a change of the task do not follow the instruction before it.
             changes = np.flatnonzero(np.diff(tasks[steps])) + 1
-            for begin, last in pairwise([0, *changes.tolist(), len(steps)]):
+            for begin, stop in pairwise([0, *changes.tolist(), len(steps)]):
                 if (task := int(tasks[steps[begin]])) not in instructions:
                     path = self.folder / layout.TASKS
                     raise UserError(f"{path} lacks task {task}, which episode {number} has: {MEND}")
-                span = slice(begin, last)
+                span = slice(begin, stop)
                 parts.append(Part(number, steps, files, span, instructions[task], float(times[0]), row))
         return parts
 
@@ -177,18 +177,18 @@ class LeRobotDataset:
             columns |= {f"{video}/chunk_index": COUNTS, f"{video}/file_index": COUNTS}
             columns |= {f"{video}/from_timestamp": TIMES, f"{video}/to_timestamp": TIMES}
         rows = tables.read(tables.files(folder), columns).sort_by(OWNER).to_pylist()
-        if twice := [row[OWNER] for row, other in pairwise(rows) if row[OWNER] == other[OWNER]]:
-            raise UserError(f"{folder} lists episode {twice[0]} more than once: {MEND}")
+        if duplicates := [row[OWNER] for row, next_row in pairwise(rows) if row[OWNER] == next_row[OWNER]]:
+            raise UserError(f"{folder} lists episode {duplicates[0]} more than once: {MEND}")
         # An incomplete copy has the totals of the whole dataset; more episodes than in the totals are no damage.
         counts = (
             ("episodes", len(rows), self.info.total_episodes),
             ("frames", sum(row[TO] - row[FROM] for row in rows), self.info.total_frames),
         )
-        for what, count, total in counts:
+        for noun, count, total in counts:
             if count < total:
                 raise UserError(
-                    f"{folder} lists {count} of the {total} {what} that meta/info.json counts: {REMEDY}, or correct "
-                    f"total_{what} there if the others were left out on purpose"
+                    f"{folder} lists {count} of the {total} {noun} that meta/info.json counts: {REMEDY}, or correct "
+                    f"total_{noun} there if the others were left out on purpose"
                 )
         if not rows:
             raise UserError(f"{self.folder} has no episodes: record some first")
@@ -197,10 +197,10 @@ class LeRobotDataset:
     def _is_video(self, key: str) -> bool:
         return self.info.features[key].dtype == "video"
 
-    def _decoded(self, part: Part, key: str, every: int) -> Iterator[Array]:
+    def _decode_images(self, part: Part, key: str, every: int) -> Iterator[Array]:
         size = self.info.features[key].image_size
         if self._is_video(key):
-            start, fps = self._begin(part, key) + part.steps.start / self.info.fps, layout.fraction(self.info.fps)
+            start, fps = self._start_time(part, key) + part.steps.start / self.info.fps, layout.fraction(self.info.fps)
             yield from decode(self._video(part, key), start, len(part), fps, size, every)
             return
         column = tables.read(part.files, {key: PICTURES}, [(OWNER, "=", part.episode)])[key][part.steps]
@@ -211,15 +211,15 @@ class LeRobotDataset:
                 step += part.steps.start
                 raise UserError(f"{self.folder}: {key} of episode {part.episode}, step {step}: {error}") from error
 
-    def _begin(self, part: Part, key: str) -> float:
+    def _start_time(self, part: Part, key: str) -> float:
         """Return the time of the first step of an episode in a video [s].
 
         Time stamps count from where the episode begins in the video. If they begin later than at 0, its first steps
         were cut off, or the stamps are of another clock: then the video does not reach as far as they do.
         """
         begin, end = part.place[f"videos/{key}/from_timestamp"], part.place[f"videos/{key}/to_timestamp"]
-        cut, steps = max(float(np.rint(part.time * self.info.fps)), 0.0), len(part.rows)
-        return begin + cut / self.info.fps if begin + (cut + steps - 0.5) / self.info.fps <= end else begin
+        offset, steps = max(float(np.rint(part.time * self.info.fps)), 0.0), len(part.rows)
+        return begin + offset / self.info.fps if begin + (offset + steps - 0.5) / self.info.fps <= end else begin
 
     def _content(self, picture: Mapping[str, Any]) -> bytes:
         """Return an image file that a cell of a table holds, or names by its path in the folder of the dataset."""
@@ -246,22 +246,22 @@ class LeRobotDataset:
         frames: dict[tuple[Path, str], int] = {}
         for part in self.parts:
             for key in keys:
-                end = round(self._begin(part, key) * self.info.fps) + len(part.rows)
+                end = round(self._start_time(part, key) * self.info.fps) + len(part.rows)
                 place = self._video(part, key), key
                 frames[place] = max(frames.get(place, 0), end)
-        if missing := [str(path.relative_to(self.folder)) for path, _ in frames if not path.exists()]:
-            more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-            raise UserError(f"{self.folder} lacks {', '.join(missing[:3])}{more}: {REMEDY}")
+        if missing_files := [str(path.relative_to(self.folder)) for path, _ in frames if not path.exists()]:
+            suffix = f" and {len(missing_files) - 3} more" if len(missing_files) > 3 else ""
+            raise UserError(f"{self.folder} lacks {', '.join(missing_files[:3])}{suffix}: {REMEDY}")
         for (path, key), count in frames.items():
             require_video(path, self.info.features[key].image_size, layout.fraction(self.info.fps), count)
 
     def _require_even(self, number: int, times: Array) -> None:
         """Require the times of an episode, counted from its first step, to follow the frame rate without gaps."""
         fps, steps = self.info.fps, np.arange(len(times))
-        off = np.abs(times - steps / fps) > (0.5 + layout.RATE_TOLERANCE * steps) / fps
-        off |= np.abs(np.diff(times, prepend=-1 / fps) - 1 / fps) > 0.5 / fps  # a step that was left out
-        if off.any():
-            step = int(np.argmax(off))
+        deviations = np.abs(times - steps / fps) > (0.5 + layout.RATE_TOLERANCE * steps) / fps
+        deviations |= np.abs(np.diff(times, prepend=-1 / fps) - 1 / fps) > 0.5 / fps  # a step that was left out
+        if deviations.any():
+            step = int(np.argmax(deviations))
             raise UserError(
                 f"{self.folder}: step {step} of episode {number} comes {times[step]:.4g} s after its first one, but at "
                 f"{fps:g} Hz, the rate in meta/info.json, it is {step / fps:.4g} s: correct fps there, or record all "
@@ -270,9 +270,9 @@ class LeRobotDataset:
 
     def _require_finite(self, name: str, values: Array, owner: Array) -> None:
         """Require the rows (N, D) of a feature to be finite; `owner` (N,) are their episodes."""
-        if len(wrong := np.argwhere(~np.isfinite(values))):
-            row, at = wrong[0]
-            step, steps = (owner[:row] == owner[row]).sum(), len(set(wrong[:, 0]))
+        if len(positions := np.argwhere(~np.isfinite(values))):
+            row, at = positions[0]
+            step, steps = (owner[:row] == owner[row]).sum(), len(set(positions[:, 0]))
             raise UserError(
                 f"{self.folder}: {name} is {values[row, at]} at index {at} in episode {owner[row]}, step {step}, the "
                 f"first of {steps} such steps: correct the numbers, or delete the episodes with lerobot-edit-dataset"
@@ -301,13 +301,13 @@ def _read_instructions(path: Path) -> dict[int, str]:
     """Return task index → instruction; the name of the column of instructions depends on the writer."""
     schema = tables.schema_of(path)
     texts = [field.name for field in schema if tables.is_text(field.type)]
-    known = [name for name in (UNNAMED, "task") if name in texts] or (texts if len(texts) == 1 else [])
-    if not known:
+    columns = [name for name in (UNNAMED, "task") if name in texts] or (texts if len(texts) == 1 else [])
+    if not columns:
         raise UserError(f"{path} has the columns {', '.join(schema.names)[:200]}, but no column task of texts: {MEND}")
-    table = tables.read([path], {TASK: COUNTS, known[0]: tables.TEXTS})
-    tasks = dict(zip(table[TASK].to_pylist(), table[known[0]].to_pylist(), strict=True))
-    if longer := [index for index, text in tasks.items() if len(text) > LONGEST_INSTRUCTION]:
-        raise UserError(f"{path}: shorten the tasks {listed(longer)}, of more than {LONGEST_INSTRUCTION} characters")
+    table = tables.read([path], {TASK: COUNTS, columns[0]: tables.TEXTS})
+    tasks = dict(zip(table[TASK].to_pylist(), table[columns[0]].to_pylist(), strict=True))
+    if indices := [index for index, text in tasks.items() if len(text) > LONGEST_INSTRUCTION]:
+        raise UserError(f"{path}: shorten the tasks {listed(indices)}, of more than {LONGEST_INSTRUCTION} characters")
     return tasks
 
 
@@ -317,11 +317,11 @@ def _require_unchanged(folder: Path) -> None:
     if not path.exists():
         return
     try:
-        expected, found = read_json(path, layout.Checksums), layout.checksums(folder)
+        saved_checksums, checksums = read_json(path, layout.Checksums), layout.checksums(folder)
     except UserError as error:
         raise UserError(f"{error}: {REMEDY}") from error
-    if changed := [name for name in expected if expected[name] != found.get(name)]:
+    if changed_files := [name for name in saved_checksums if saved_checksums[name] != checksums.get(name)]:
         raise UserError(
-            f"{folder} has changed since it was exported, in {', '.join(changed)[:200]}: {REMEDY}, or delete "
+            f"{folder} has changed since it was exported, in {', '.join(changed_files)[:200]}: {REMEDY}, or delete "
             f"{layout.CHECKSUMS} if this was intended"
         )

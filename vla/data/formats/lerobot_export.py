@@ -63,19 +63,19 @@ class LeRobotExporter:
         store.require_episodes()
         episodes = [provenance(entry) for entry in store.episodes]
         source = {"spec": store.spec.to_dict(), "crf": self._crf, "episodes": episodes}
-        with staging_folder(self._folder) as place:
-            if _holds(self._folder, source):
+        with staging_folder(self._folder) as staging:
+            if _is_complete(self._folder, source):
                 return self._folder
             if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):
                 raise UserError(f"{self._folder} has content other than these episodes: choose another export.folder")
             if store.codec.images == "jpeg":
                 log.warning("videos lose more of the JPEG images in %s: export=files loses nothing", store.folder)
-            draft = place / "dataset"
-            if not _is_of(draft, source):
+            draft = staging / "dataset"
+            if not _has_source(draft, source):
                 shutil.rmtree(draft, ignore_errors=True)
                 write_json(draft / "meta/vla.json", source)
-            for half in draft.rglob(".*"):  # what a killed process was writing
-                half.unlink()
+            for leftover in draft.rglob(".*"):  # what a killed process was writing
+                leftover.unlink()
             self._write(draft, store, cluster)
             os.rename(draft, self._folder)
         return self._folder
@@ -88,18 +88,18 @@ class LeRobotExporter:
         for (camera, _), counts in zip(units, map_episodes(work, store, units, cluster), strict=True):
             histograms[camera] += counts
         tasks = [*dict.fromkeys(entry.instruction for entry in store.episodes)]
-        columns = list(_columns(store, tasks))
-        episodes = [_episode(store, number, one, histograms) for number, one in enumerate(columns)]
-        whole = {name: np.concatenate([one[name] for one in columns]) for name in columns[0]}
-        statistics = {name: _moments(values) for name, values in whole.items()}
+        episode_columns = list(_columns(store, tasks))
+        episodes = [_episode(store, number, columns, histograms) for number, columns in enumerate(episode_columns)]
+        dataset = {name: np.concatenate([columns[name] for columns in episode_columns]) for name in episode_columns[0]}
+        statistics = {name: _moments(values) for name, values in dataset.items()}
         for camera, counts in histograms.items():
-            statistics[layout.IMAGES + camera] = _image_moments(np.sum(counts, 0), len(whole["index"]))
-        write_rows(_made(draft / layout.place(layout.DATA)), columns)
+            statistics[layout.IMAGES + camera] = _image_moments(np.sum(counts, 0), len(dataset["index"]))
+        write_rows(_ensure_parent(draft / layout.place(layout.DATA)), episode_columns)
         table = pa.Table.from_pylist(episodes)
-        pq.write_table(table, _made(draft / layout.place(layout.EPISODES)), write_page_checksum=True)
+        pq.write_table(table, _ensure_parent(draft / layout.place(layout.EPISODES)), write_page_checksum=True)
         write_tasks(draft / layout.TASKS, tasks)
         write_json(draft / "meta/stats.json", statistics)
-        info = layout.info(store.spec, len(episodes), len(whole["index"]), len(tasks))
+        info = layout.info(store.spec, len(episodes), len(dataset["index"]), len(tasks))
         write_json(draft / "meta/info.json", info)
         write_json(draft / layout.CHECKSUMS, layout.checksums(draft))
 
@@ -115,26 +115,26 @@ class LeRobotExporter:
                 histograms.append(np.stack([np.bincount(values, minlength=256) for values in colours]))
                 yield images
 
-        path = _made(draft / layout.place(layout.VIDEOS, file, video_key=layout.IMAGES + camera))
+        path = _ensure_parent(draft / layout.place(layout.VIDEOS, file, video_key=layout.IMAGES + camera))
         if path.exists():
             deque(clips(), 0)  # the histograms are needed in any case
         else:
-            unfinished, fps = path.with_suffix(".draft"), layout.fraction(store.spec.control_hz)
-            encode(unfinished, clips(), store.spec.image_size, fps, self._crf)
-            os.replace(unfinished, path)
+            draft_file, fps = path.with_suffix(".draft"), layout.fraction(store.spec.control_hz)
+            encode(draft_file, clips(), store.spec.image_size, fps, self._crf)
+            os.replace(draft_file, path)
         return histograms
 
 
-def _holds(folder: Path, source: Mapping[str, Any]) -> bool:
+def _is_complete(folder: Path, source: Mapping[str, Any]) -> bool:
     """Return whether a folder has the whole dataset of these episodes."""
     try:
         files = read_json(folder / layout.CHECKSUMS, layout.Checksums)
     except (OSError, ValueError):  # missing or incomplete
         return False
-    return all((folder / name).is_file() for name in files) and _is_of(folder, source)
+    return all((folder / name).is_file() for name in files) and _has_source(folder, source)
 
 
-def _is_of(folder: Path, source: Mapping[str, Any]) -> bool:
+def _has_source(folder: Path, source: Mapping[str, Any]) -> bool:
     """Return whether a folder was begun from the same episodes, with the same options."""
     try:
         return read_json(folder / "meta/vla.json", dict[str, Any], MAX_SOURCE_BYTES) == source
@@ -142,7 +142,7 @@ def _is_of(folder: Path, source: Mapping[str, Any]) -> bool:
         return False
 
 
-def _made(path: Path) -> Path:
+def _ensure_parent(path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
@@ -174,7 +174,7 @@ def _episode(
     """Return the row of an episode in `meta/episodes/`."""
     entries, fps = store.episodes, layout.fraction(store.spec.control_hz)
     file, place = divmod(number, EPISODES_PER_VIDEO)
-    before = sum(entry.steps for entry in entries[number - place : number])  # in the same video
+    offset = sum(entry.steps for entry in entries[number - place : number])  # in the same video
     begin, steps = int(columns["index"][0]), entries[number].steps
     row: dict[str, Any] = {
         "episode_index": number,
@@ -192,29 +192,29 @@ def _episode(
     for camera, counts in histograms.items():
         video = f"videos/{layout.IMAGES}{camera}"
         row |= {f"{video}/chunk_index": chunk, f"{video}/file_index": file}
-        row |= {f"{video}/from_timestamp": float(before / fps), f"{video}/to_timestamp": float((before + steps) / fps)}
+        row |= {f"{video}/from_timestamp": float(offset / fps), f"{video}/to_timestamp": float((offset + steps) / fps)}
         statistics[layout.IMAGES + camera] = _image_moments(counts[number], steps)
-    return row | {f"stats/{key}/{name}": value for key, of in statistics.items() for name, value in of.items()}
+    return row | {f"stats/{key}/{name}": value for key, values in statistics.items() for name, value in values.items()}
 
 
 def _moments(values: Array) -> Statistics:
     """Compute moments and quantiles of (N,) or (N, D) values over the steps, one number per component."""
     values = values.reshape(len(values), -1).astype(np.float64)
-    found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
-    found |= zip(QUANTILES, np.quantile(values, [*QUANTILES.values()], axis=0), strict=True)
-    return {name: value.tolist() for name, value in found.items()} | {"count": [len(values)]}
+    moments = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
+    moments |= zip(QUANTILES, np.quantile(values, [*QUANTILES.values()], axis=0), strict=True)
+    return {name: value.tolist() for name, value in moments.items()} | {"count": [len(values)]}
 
 
 def _image_moments(counts: Array, images: int) -> Statistics:
     """Compute the same statistics of images in 0…1 from their histograms, `counts` (3, 256); each (3, 1, 1)."""
     levels, total = np.arange(256) / 255, counts.sum(1)
     mean = counts @ levels / total
-    rising = counts.cumsum(1) / total[:, None]
-    found = {
+    distribution = counts.cumsum(1) / total[:, None]
+    moments = {
         "min": levels[(counts > 0).argmax(1)],
         "max": levels[255 - (counts[:, ::-1] > 0).argmax(1)],
         "mean": mean,
         "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0)),
-        **{name: levels[(rising >= share).argmax(1)] for name, share in QUANTILES.items()},
+        **{name: levels[(distribution >= share).argmax(1)] for name, share in QUANTILES.items()},
     }
-    return {name: value.reshape(3, 1, 1).tolist() for name, value in found.items()} | {"count": [images]}
+    return {name: value.reshape(3, 1, 1).tolist() for name, value in moments.items()} | {"count": [images]}

@@ -71,20 +71,20 @@ def decode(
 ) -> Iterator[Array]:
     """Yield every `every`-th of `count` frames of a video from `start` [s] on, (H, W, 3) uint8 of `size` (H, W)
     (UserError: the video cannot be read, has images of another size, or lacks a frame)."""
-    wanted = 0
-    with _opened(path) as (file, stream):
+    next_number = 0
+    with _open_video(path) as (file, stream):
         _require_size(path, stream, size)  # before anything is decoded
         file.seek(round(start / (stream.time_base or 1)), stream=stream)  # the key frame before it
         for frame in file.decode(stream):
             _require_size(path, frame, size)
             number = -1 if frame.time is None else round((frame.time - start) * float(fps))
-            if number == wanted < count:
+            if number == next_number < count:
                 yield frame.to_ndarray(format="rgb24")
-                wanted += every
-            if wanted >= count or number > wanted:
+                next_number += every
+            if next_number >= count or number > next_number:
                 break
-    if wanted < count:
-        raise UserError(f"{path} lacks the frame at {start + wanted / float(fps):.3f} s: {AGAIN}")
+    if next_number < count:
+        raise UserError(f"{path} lacks the frame at {start + next_number / float(fps):.3f} s: {AGAIN}")
 
 
 def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) -> None:
@@ -92,10 +92,10 @@ def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) 
 
     The rate may differ as long as the first `count` images are the right ones.
     """
-    with _opened(path) as (_, stream):
+    with _open_video(path) as (_, stream):
         _require_size(path, stream, size)
         rates, frames = [rate for rate in (stream.average_rate, stream.base_rate) if rate], stream.frames
-    rate = min(rates, key=lambda each: abs(each - fps), default=fps)  # the average may count the last image less
+    rate = min(rates, key=lambda rate: abs(rate - fps), default=fps)  # the average may count the last image less
     if abs(rate - fps) * count > 0.5 * fps:
         raise UserError(
             f"{path} has {float(rate):.5g} images per second, the dataset {float(fps):.5g}: encode the video again at "
@@ -106,7 +106,7 @@ def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) 
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+def _open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
     """Open a video and its first stream; errors of reading it within the context become a UserError."""
     require_file(path)
     try:

@@ -67,18 +67,18 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         spec: Spec,
     ) -> None:
         self.spec, self._every = spec.without_truth, every
-        self._dataset = dataset = _opened(folder, images)
+        self._dataset = dataset = _open_dataset(folder, images)
         self._control_hz = (control_hz or dataset.info.fps) / every
         features = dataset.info.features
         self._state = dataset.components(state, [spec.state[index] for index in spec.pose], in_order)
         self._action = dataset.components(action, spec.action, in_order)
         rates = [layout.RATES] if layout.RATES in features and features[layout.RATES].components else []
-        self._state |= {name: at for name, at in dataset.components(rates).items() if name not in self._state}
+        self._state |= {name: place for name, place in dataset.components(rates).items() if name not in self._state}
         executed = dataset.components([layout.EXECUTED]) if layout.EXECUTED in features else {}
         has_executed = all(name in executed for name in spec.action)
-        self._lacks = ["depth"] if spec.depth else []
-        self._lacks += [] if has_executed else [layout.EXECUTED]
-        self._lacks += [] if all(name in self._state for name in spec.state) else [layout.RATES]
+        self._missing_fields = ["depth"] if spec.depth else []
+        self._missing_fields += [] if has_executed else [layout.EXECUTED]
+        self._missing_fields += [] if all(name in self._state for name in spec.state) else [layout.RATES]
         differences = [*self._mismatches()]
         if all(name in self._action for name in spec.action):
             keys = [*state, *action, *rates, *([layout.EXECUTED] if has_executed else [])]
@@ -108,7 +108,7 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         in_order: bool,
     ) -> imported.Recording:
         """Describe a dataset, see `ImportedDemonstrations.recording`."""
-        dataset = _opened(folder, images)
+        dataset = _open_dataset(folder, images)
         if not dataset.images:
             raise UserError(f"{dataset.folder} has no images, which policies need: record it with a camera")
         states, actions = dataset.components(state), dataset.components(action)
@@ -133,22 +133,22 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         images = {
             f"rgb_{camera}": dataset.frames(part, camera, spec.image_size, self._every) for camera in spec.cameras
         }
-        recorded = {"episode": part.episode, "first_step": part.steps.start, "lacks": self._lacks}
-        executed = None if layout.EXECUTED in self._lacks else self._executed[self._steps(number)[1]]
-        words, state, actions = self.numbers(number)
+        origin = {"episode": part.episode, "first_step": part.steps.start, "lacks": self._missing_fields}
+        executed = None if layout.EXECUTED in self._missing_fields else self._executed[self._steps(number)[1]]
+        instruction, state, actions = self.numbers(number)
         rows = {**images, "state": state}
-        return self.recorded_episode(number, words, "success", recorded, rows, actions, executed)
+        return self.recorded_episode(number, instruction, "success", origin, rows, actions, executed)
 
     def numbers(self, number: int) -> tuple[str, Array, Array]:
         """Return an episode without its images: instruction, state (N, P) and actions (N, D)."""
-        part, (first, last) = self._dataset.parts[number], self._steps(number)
-        return part.instruction, self._states(part.rows)[first], self._actions[last]
+        part, (first_steps, last_rows) = self._dataset.parts[number], self._steps(number)
+        return part.instruction, self._states(part.rows)[first_steps], self._actions[last_rows]
 
     def _steps(self, number: int) -> tuple[Array, Array]:
         """Return the first step of every period of an episode, and the row of its last, whose action is the target."""
         part = self._dataset.parts[number]
-        first = np.arange(part.steps.start, part.steps.stop, self._every)
-        return first, part.rows[np.minimum(first + self._every - 1, part.steps.stop - 1)]
+        first_steps = np.arange(part.steps.start, part.steps.stop, self._every)
+        return first_steps, part.rows[np.minimum(first_steps + self._every - 1, part.steps.stop - 1)]
 
     def fill(self, store: EpisodeStore, episodes: int) -> int:
         """Append episodes, and log what an import changes: images, episodes of several tasks, actions beyond bounds."""
@@ -156,9 +156,9 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
             shape = self._dataset.info.features[self._dataset.images[camera]].image_size
             if shape != tuple(self.spec.image_size):
                 log.info("images of %s are cropped at the centre and resized to task.image_size", camera)
-        whole = len({part.episode for part in self._dataset.parts})
-        if whole < len(self):
-            log.info("episodes: %d become %d, one per instruction: the task changes within some", whole, len(self))
+        recordings = len({part.episode for part in self._dataset.parts})
+        if recordings < len(self):
+            log.info("episodes: %d become %d, one per instruction: the task changes within some", recordings, len(self))
         imported.log_clipped(self._actions, self.spec)
         return super().fill(store, episodes)
 
@@ -167,41 +167,41 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         dataset, spec = self._dataset, self.spec
         if abs(self._control_hz - spec.control_hz) > layout.RATE_TOLERANCE * spec.control_hz:
             yield f"its rate is {self._control_hz:g} Hz (expert.every={self._every}), the task's {spec.control_hz:g} Hz"
-        if missing := [camera for camera in spec.cameras if camera not in dataset.images]:
-            have = _shortened(dataset.images) or "no camera at all"
-            yield f"expert.images gives no key for {' and '.join(missing)}, and there are images of {have}"
-        derived = spec.robot.velocities if spec.robot else ()
-        for kind, places, ours in (
-            ("state", self._state, [name for name in spec.state if name not in derived]),
+        if missing_cameras := [camera for camera in spec.cameras if camera not in dataset.images]:
+            cameras = _name_list(dataset.images) or "no camera at all"
+            yield f"expert.images gives no key for {' and '.join(missing_cameras)}, and there are images of {cameras}"
+        derived_names = spec.robot.velocities if spec.robot else ()
+        for kind, places, names in (
+            ("state", self._state, [name for name in spec.state if name not in derived_names]),
             ("action", self._action, [*spec.action]),
         ):
-            if any(name not in places for name in ours):
-                theirs = f"its {kind} has {len(places)} numbers ({_shortened(places)})"
-                in_order = ": expert.in_order=true takes them in their order" if len(places) == len(ours) else ""
-                yield f"{theirs}, that of the task {len(ours)} ({_shortened(ours)}){in_order}"
+            if any(name not in places for name in names):
+                description = f"its {kind} has {len(places)} numbers ({_name_list(places)})"
+                advice = ": expert.in_order=true takes them in their order" if len(places) == len(names) else ""
+                yield f"{description}, that of the task {len(names)} ({_name_list(names)}){advice}"
 
     def _states(self, rows: Array) -> Array:
         """Return the state in the rows of an episode, (N, P) float32; unknown velocities are differences."""
-        spec, known = self.spec, dict[str, Array]()
-        if layout.RATES in self._lacks and spec.robot:
+        spec, columns = self.spec, dict[str, Array]()
+        if layout.RATES in self._missing_fields and spec.robot:
             joints = self._columns(spec.robot.joints, self._state, rows)
             rates = np.diff(joints, axis=0, prepend=joints[:1]) * np.float32(self._control_hz * self._every)
-            known = dict(zip(spec.robot.velocities, rates.T, strict=True))
+            columns = dict(zip(spec.robot.velocities, rates.T, strict=True))
         names = [name for name in spec.state if name in self._state]
-        known |= dict(zip(names, self._columns(names, self._state, rows).T, strict=True))
-        return np.stack([known[name] for name in spec.state], axis=1)
+        columns |= dict(zip(names, self._columns(names, self._state, rows).T, strict=True))
+        return np.stack([columns[name] for name in spec.state], axis=1)
 
     def _columns(self, names: Iterable[str], places: Places, rows: Array | slice) -> Array:
         """Return components by name, (N, …) float32, in rows of the dataset."""
-        return np.stack([self._numbers[key][rows, at] for key, at in map(places.__getitem__, names)], axis=1)
+        return np.stack([self._numbers[key][rows, index] for key, index in map(places.__getitem__, names)], axis=1)
 
 
-def _shortened(names: Iterable[str]) -> str:
+def _name_list(names: Iterable[str]) -> str:
     text = ", ".join(names)
     return text if len(text) <= MAX_NAMES else f"{text[:MAX_NAMES]}…"
 
 
-def _opened(folder: Path | str | None, images: dict[str, Text] | None) -> LeRobotDataset:
+def _open_dataset(folder: Path | str | None, images: dict[str, Text] | None) -> LeRobotDataset:
     if folder is None:
         raise UserError("expert=lerobot needs a dataset: name its folder with expert=lerobot expert.folder=DIR")
     return LeRobotDataset(Path(folder), images)
@@ -210,6 +210,6 @@ def _opened(folder: Path | str | None, images: dict[str, Text] | None) -> LeRobo
 def _factors(scale: Mapping[str, float] | None, names: Sequence[str]) -> Array:
     """Return the factors of action components, (D,) float32; a UserError if `scale` names others."""
     scale = scale or {}
-    if unknown := [name for name in scale if name not in names]:
-        raise UserError(f"expert.scale names {', '.join(unknown)}, the actions are {_shortened(names)}")
+    if unknown_names := [name for name in scale if name not in names]:
+        raise UserError(f"expert.scale names {', '.join(unknown_names)}, the actions are {_name_list(names)}")
     return np.array([scale.get(name, 1.0) for name in names], np.float32)

@@ -66,10 +66,10 @@ class Feature:
             names = sorted(names, key=names.__getitem__)
         elif isinstance(names, dict) and all(isinstance(part, list) for part in names.values()):
             parts = [(key, str(name)) for key, part in names.items() for name in part]
-            apart = len({name for _, name in parts}) == len(parts)
-            names = [name if apart else f"{key}_{name}" for key, name in parts]
-        known = isinstance(names, list) and all(isinstance(name, str) for name in names)
-        return names if known and [len(names)] == list(self.shape) else []
+            distinct = len({name for _, name in parts}) == len(parts)
+            names = [name if distinct else f"{key}_{name}" for key, name in parts]
+        are_texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
+        return names if are_texts and [len(names)] == list(self.shape) else []
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -81,8 +81,8 @@ class Feature:
     @property
     def is_depth(self) -> bool:
         """True if the images are depth images."""
-        told = [part for part in (self.info, self.video_info) if isinstance(part, dict)]
-        return any(True in (part.get("is_depth_map"), part.get("video.is_depth_map")) for part in told)
+        descriptions = [part for part in (self.info, self.video_info) if isinstance(part, dict)]
+        return any(True in (part.get("is_depth_map"), part.get("video.is_depth_map")) for part in descriptions)
 
 
 @dataclass
@@ -102,14 +102,14 @@ Checksums = dict[str, Annotated[int, Ge(0)]]  # path in the dataset → CRC-32
 
 def checksums(folder: Path) -> Checksums:
     """Compute the checksums of all files of a dataset but `CHECKSUMS`."""
-    found: Checksums = {}
+    crcs: Checksums = {}
     for path in sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / CHECKSUMS):
         crc = 0
         with path.open("rb") as file:
             while block := file.read(1 << 20):
                 crc = zlib.crc32(block, crc)
-        found[path.relative_to(folder).as_posix()] = crc
-    return found
+        crcs[path.relative_to(folder).as_posix()] = crc
+    return crcs
 
 
 def place(pattern: str, file: int = 0, **names: str) -> str:

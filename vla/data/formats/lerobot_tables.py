@@ -52,13 +52,13 @@ def _are_files(column: Column) -> bool:
     return any(holds(kinds["bytes"]) for holds in (pa.types.is_binary, pa.types.is_large_binary, pa.types.is_null))
 
 
-def _within(column: Column, high: float) -> bool:
+def _is_within(column: Column, high: float) -> bool:
     values = column.to_numpy()  # nulls become NaN
     return not column.null_count and bool(((values >= 0) & (values <= high)).all())
 
 
-COUNTS: Kind = "integers from 0 on", lambda column: pa.types.is_integer(column.type) and _within(column, 2**53)
-TIMES: Kind = "seconds", lambda column: pa.types.is_floating(column.type) and _within(column, MAX_SECONDS)
+COUNTS: Kind = "integers from 0 on", lambda column: pa.types.is_integer(column.type) and _is_within(column, 2**53)
+TIMES: Kind = "seconds", lambda column: pa.types.is_floating(column.type) and _is_within(column, MAX_SECONDS)
 TEXTS: Kind = "text", lambda column: is_text(column.type) and not column.null_count
 NUMBERS: Kind = "lists of numbers", _are_numbers
 PICTURES: Kind = "images, as the bytes of a file", _are_files
@@ -66,8 +66,8 @@ PICTURES: Kind = "images, as the bytes of a file", _are_files
 
 def files(folder: Path) -> list[Path]:
     """Return the files of a table, in their order; a UserError if there are none."""
-    if found := sorted(folder.glob("chunk-*/file-*.parquet")):
-        return found
+    if paths := sorted(folder.glob("chunk-*/file-*.parquet")):
+        return paths
     raise UserError(f"{folder} holds no tables: {REMEDY}")
 
 
@@ -77,8 +77,8 @@ def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -
     tables = list[pa.Table]()
     for path in paths:
         require(path, columns)
-        if (unpacked := _unpacked_size(path, columns, only is not None)) > MAX_BYTES:
-            raise UserError(f"{path} unpacks to {unpacked / 1e9:.1f} GB, more than {MAX_BYTES / 1e9:.1f} GB: divide it")
+        if (size := _unpacked_size(path, columns, only is not None)) > MAX_BYTES:
+            raise UserError(f"{path} unpacks to {size / 1e9:.1f} GB, more than {MAX_BYTES / 1e9:.1f} GB: divide it")
         try:
             table = pq.read_table(path, columns=[*columns], filters=only, page_checksum_verification=True)
             table.validate(full=True)
@@ -99,18 +99,18 @@ def _unpacked_size(path: Path, columns: Collection[str], filtered: bool) -> int:
     """
     metadata, sizes = pq.read_metadata(path), []
     for group in (metadata.row_group(number) for number in range(metadata.num_row_groups)):
-        of = [group.column(number) for number in range(group.num_columns)]
-        chosen = [each for each in of if any(f"{each.path_in_schema}.".startswith(f"{name}.") for name in columns)]
-        sizes.append(sum(max(column.total_uncompressed_size, 8 * column.num_values) for column in chosen))
+        parts = [group.column(number) for number in range(group.num_columns)]
+        parts = [part for part in parts if any(f"{part.path_in_schema}.".startswith(f"{name}.") for name in columns)]
+        sizes.append(sum(max(part.total_uncompressed_size, 8 * part.num_values) for part in parts))
     return (max if filtered else sum)([0, *sizes])
 
 
 def require(path: Path, columns: Mapping[str, Kind]) -> None:
     """Raise a UserError unless a file has columns of the expected types; their values are not read."""
-    empty = schema_of(path).empty_table()
-    if wrong := [name for name in columns if empty.column_names.count(name) != 1]:
-        raise UserError(f"{path} lacks the columns {', '.join(wrong)}, or has them twice: {MEND}")
-    _require_kinds(path, empty, columns)
+    empty_table = schema_of(path).empty_table()
+    if wrong_columns := [name for name in columns if empty_table.column_names.count(name) != 1]:
+        raise UserError(f"{path} lacks the columns {', '.join(wrong_columns)}, or has them twice: {MEND}")
+    _require_kinds(path, empty_table, columns)
 
 
 def schema_of(path: Path) -> pa.Schema:
@@ -168,7 +168,7 @@ def write_rows(path: Path, episodes: Sequence[Mapping[str, Array]]) -> None:
     """
     features = {name: _feature(values) for name, values in episodes[0].items()}
     metadata = {"huggingface": json.dumps({"info": {"features": features}})}
-    tables = [pa.table({name: _arrow(values) for name, values in each.items()}, metadata=metadata) for each in episodes]
+    tables = [pa.table({name: _arrow(values) for name, values in rows.items()}, metadata=metadata) for rows in episodes]
     with pq.ParquetWriter(path, tables[0].schema, compression="zstd", write_page_checksum=True) as writer:
         for table in tables:
             writer.write_table(table)

@@ -20,16 +20,16 @@ def in_basic_terms(words: Sequence[str]) -> list[str]:
     Args:
         words: words of a sentence in lower case.
     """
-    known, found = terms(), list[str]()
-    longest = max(len(name.split()) for name in known)
+    basic_terms, result = terms(), list[str]()
+    longest = max(len(name.split()) for name in basic_terms)
     start, replaced = 0, False
     while start < len(words):
-        ahead = [" ".join(words[start : start + length]) for length in range(longest, 0, -1)]
-        name = next((name for name in ahead if name in known), None)
+        phrases = [" ".join(words[start : start + length]) for length in range(longest, 0, -1)]
+        name = next((name for name in phrases if name in basic_terms), None)
         replaced = name is not None and not replaced  # a name after a name is a thing
-        found.append(known[name] if name and replaced else words[start])
+        result.append(basic_terms[name] if name and replaced else words[start])
         start += len(name.split()) if name and replaced else 1
-    return found
+    return result
 
 
 @cache
@@ -41,8 +41,8 @@ def terms() -> dict[str, str]:
     """
     from matplotlib.colors import XKCD_COLORS, to_rgb
 
-    colours = {name.removeprefix("xkcd:"): np.array(to_rgb(value)) for name, value in XKCD_COLORS.items()}
-    sure = [name for name in colours if name.split()[-1] in TERMS and sum(word in TERMS for word in name.split()) == 1]
-    places = np.array([colours[name] for name in sure])
-    nearest = {name: sure[np.linalg.norm(places - colour, axis=1).argmin()] for name, colour in colours.items()}
-    return {name: (name if name in sure else near).split()[-1] for name, near in nearest.items()}
+    rgb = {name.removeprefix("xkcd:"): np.array(to_rgb(value)) for name, value in XKCD_COLORS.items()}
+    anchors = [name for name in rgb if name.split()[-1] in TERMS and sum(word in TERMS for word in name.split()) == 1]
+    places = np.array([rgb[name] for name in anchors])
+    nearest = {name: anchors[np.linalg.norm(places - colour, axis=1).argmin()] for name, colour in rgb.items()}
+    return {name: (name if name in anchors else anchor).split()[-1] for name, anchor in nearest.items()}

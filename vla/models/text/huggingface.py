@@ -76,12 +76,12 @@ class SentenceEncoder:
 
     def embed(self, sentence: str) -> Tensor:
         """Return the vector of a sentence, (E,) float32: the network's own if it has one, else the mean over tokens."""
-        found = self._vectors.get(sentence)
-        if found is None:
+        vector = self._vectors.get(sentence)
+        if vector is None:
             if len(self._vectors) >= KEPT:
                 self._vectors.clear()
-            found = self._vectors[sentence] = self._embed(sentence)
-        return found
+            vector = self._vectors[sentence] = self._embed(sentence)
+        return vector
 
     @torch.no_grad()
     def _embed(self, sentence: str) -> Tensor:
@@ -130,12 +130,12 @@ class HuggingFace(TextEncoder):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Raise a UserError if the frozen encoder differs from the one in training."""
-        trained = state.get("sha256") if isinstance(state, dict) else self.encoder.sha256  # sharded models load none
-        if trained != self.encoder.sha256:
+        digest = state.get("sha256") if isinstance(state, dict) else self.encoder.sha256  # sharded models load none
+        if digest != self.encoder.sha256:
             revision = f", revision {state.get('revision')}" if state.get("revision") else ""
             raise UserError(
                 f"{self._name} is another text encoder than in training: its weights have the SHA-256 "
-                f"{self.encoder.sha256[:8]}…, get those with {str(trained)[:8]}…{revision}"
+                f"{self.encoder.sha256[:8]}…, get those with {str(digest)[:8]}…{revision}"
             )
 
 
@@ -143,11 +143,11 @@ class HuggingFace(TextEncoder):
 def _folder(name: str | PackagedFile) -> Iterator[Path]:
     """Yield the folder of an encoder, a temporary one if it comes out of a package."""
     if isinstance(name, PackagedFile):
-        found = name.locate(*FILES)
-        if found.is_dir():
-            yield found
+        path = name.locate(*FILES)
+        if path.is_dir():
+            yield path
             return
-        with TemporaryDirectory() as folder, ZipFile(found) as archive:
+        with TemporaryDirectory() as folder, ZipFile(path) as archive:
             archive.extractall(folder)
             yield Path(folder)
     elif Path(name).is_dir():
@@ -174,9 +174,9 @@ def _network(folder: Path) -> tuple[Any, str | None]:
     network, report = getattr(transformers, kind).from_pretrained(
         folder, config=config, use_safetensors=True, dtype=torch.float32, output_loading_info=True
     )
-    missing = sorted(name for name in report["missing_keys"] if not name.startswith("pooler."))  # not used
-    if missing:
-        raise UserError(f"its weights are those of another network, {missing[0]} is missing")
+    missing_weights = sorted(name for name in report["missing_keys"] if not name.startswith("pooler."))  # not used
+    if missing_weights:
+        raise UserError(f"its weights are those of another network, {missing_weights[0]} is missing")
     return network.eval().requires_grad_(False), output
 
 

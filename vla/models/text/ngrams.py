@@ -89,7 +89,7 @@ class NGrams(TextEncoder):
         super().__init__(width)
         self.vocabulary, self.words, self.basic_colours = vocabulary, words, basic_colours
         self.dropout, self.word_dropout = dropout, word_dropout
-        self.replaced = tuple(_replaced(synonyms).items())  # in the order in which they are looked for
+        self.replaced = tuple(_replacements(synonyms).items())  # in the order in which they are looked for
         self.embedding = nn.Embedding(vocabulary, width, padding_idx=PADDING)
         with torch.no_grad():
             self.embedding.weight.mul_(INITIAL_STD)
@@ -99,28 +99,28 @@ class NGrams(TextEncoder):
     def tokenize(self, sentences: list[str]) -> Tensor:
         """Return (B, L) int64 hashes, padded with 0: of n-grams, or with word dropout of words, case ignored."""
         words = None if self.word_dropout is not None else self.words
-        rows = [_hashes(each, self.vocabulary, words, self.basic_colours, self.replaced) for each in sentences]
+        rows = [_hashes(sentence, self.vocabulary, words, self.basic_colours, self.replaced) for sentence in sentences]
         return nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=PADDING)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Return (B, width) vectors for (B, L) tokens; 0 is ignored at any position."""
         rows = tokens
         if self.word_dropout is not None:
-            rows = self._rows(_hashed_ngrams(self._known(tokens, self.word_dropout), self.words))
+            rows = self._rows(_ngram_hashes(self._drop_words(tokens, self.word_dropout), self.words))
         if self.training and self.dropout:
             rows = rows * (torch.rand(rows.shape, device=rows.device) >= self.dropout)
         count = (rows != PADDING).sum(1, keepdim=True).clamp(min=1)
         return self.norm(self.embedding(rows).sum(1) / count)
 
-    def _known(self, tokens: Tensor, rate: float) -> Tensor:
+    def _drop_words(self, tokens: Tensor, rate: float) -> Tensor:
         """Drop words from (B, W) tokens: in training at random, at `rate`, otherwise those unknown from training."""
         rows = self._rows(tokens)
         if self.training:
             self.heard.index_fill_(0, rows.flatten(), True)  # in each process; those of the first one are saved
-            left_out = torch.rand(tokens.shape, device=tokens.device) < rate
+            mask = torch.rand(tokens.shape, device=tokens.device) < rate
         else:
-            left_out = ~self.heard[rows]
-        return padding_last(tokens.masked_fill(left_out, PADDING), PADDING)
+            mask = ~self.heard[rows]
+        return padding_last(tokens.masked_fill(mask, PADDING), PADDING)
 
     def _rows(self, hashes: Tensor) -> Tensor:
         """Return the rows of the embedding for hashes below 2^31."""
@@ -132,21 +132,21 @@ def words_of(sentence: str) -> list[str]:
     return re.findall(r"\w+", sentence.lower())
 
 
-def _replaced(synonyms: Mapping[str, Sequence[str]]) -> dict[str, str]:
+def _replacements(synonyms: Mapping[str, Sequence[str]]) -> dict[str, str]:
     """Return words → their replacement, the longest first; replacements are mapped to themselves."""
-    pairs = [(word, chosen) for chosen, others in synonyms.items() for word in (chosen, *others) if word]
-    if twice := sorted({word for word, _ in pairs if sum(word == other for other, _ in pairs) > 1}):
-        raise UserError(f"model.text.synonyms has {', '.join(map(repr, twice))} more than once: omit all but one")
+    pairs = [(word, term) for term, variants in synonyms.items() for word in (term, *variants) if word]
+    if duplicates := sorted({word for word, _ in pairs if sum(word == name for name, _ in pairs) > 1}):
+        raise UserError(f"model.text.synonyms has {', '.join(map(repr, duplicates))} more than once: omit all but one")
     return dict(sorted(pairs, key=lambda pair: -len(pair[0])))
 
 
 @lru_cache(KEPT)
 def _hashes(
-    sentence: str, vocabulary: int, longest: int | None, basic_colours: bool, replaced: tuple[tuple[str, str], ...]
+    sentence: str, vocabulary: int, longest: int | None, basic_colours: bool, replacements: tuple[tuple[str, str], ...]
 ) -> Tensor:
     """Return the hashes of n-grams of up to `longest` words and of characters, or, if it is None, of the words."""
-    if replaced:
-        table = dict(replaced)
+    if replacements:
+        table = dict(replacements)
         sentence = re.sub(rf"\b(?:{'|'.join(map(re.escape, table))})\b", lambda word: table[word[0]], sentence.lower())
     words = in_basic_terms(words_of(sentence)) if basic_colours else words_of(sentence)
     # crc32, because hash() differs between processes.
@@ -162,8 +162,8 @@ def _word_ngrams(words: list[str], longest: int) -> list[str]:
 
 def _character_ngrams(words: list[str]) -> list[str]:
     """Return the character n-grams of every word with its ends marked; the prefix # tells them from words."""
-    marked = [f"<{word}>" for word in words]
-    return [f"#{word[i : i + CHARACTERS]}" for word in marked for i in range(len(word) - CHARACTERS + 1)]
+    marked_words = [f"<{word}>" for word in words]
+    return [f"#{word[i : i + CHARACTERS]}" for word in marked_words for i in range(len(word) - CHARACTERS + 1)]
 
 
 def padding_last(tokens: Tensor, padding: int) -> Tensor:
@@ -173,12 +173,12 @@ def padding_last(tokens: Tensor, padding: int) -> Tensor:
     return tokens.gather(1, torch.where(tokens == padding, places + length, places).argsort(1))
 
 
-def _hashed_ngrams(tokens: Tensor, longest: int) -> Tensor:
+def _ngram_hashes(tokens: Tensor, longest: int) -> Tensor:
     """Return hashes of the n-grams of up to `longest` of (B, W) tokens, (B, L); `PADDING` where a row is too short."""
     length = tokens.shape[1]
     padded = nn.functional.pad(tokens, (0, longest - 1), value=PADDING)
     grams = [tokens]
-    for further in range(1, longest):
-        following = padded[:, further : further + length]
-        grams.append(torch.where(following == PADDING, PADDING, (grams[-1] * FACTOR + following) % PRIME))
+    for offset in range(1, longest):
+        next_tokens = padded[:, offset : offset + length]
+        grams.append(torch.where(next_tokens == PADDING, PADDING, (grams[-1] * FACTOR + next_tokens) % PRIME))
     return torch.cat(grams, 1)

@@ -54,14 +54,14 @@ class Fast(ActionTokenizer):
         super().__init__(spec, low, high, bins)
         self.scale, self.chunk = scale, chunk
         sample = np.stack([low, high])[:, None].repeat(chunk, 1) if statistics is None else statistics.chunks(chunk)
-        first, last = np.quantile(sample.astype(np.float64), QUANTILES, axis=(0, 1))
-        allowed = np.array(spec.high) - np.array(spec.low)
-        self.register_buffer("centre", torch.as_tensor((first + last) / 2, dtype=torch.float32))
+        lower, upper = np.quantile(sample.astype(np.float64), QUANTILES, axis=(0, 1))
+        allowed_span = np.array(spec.high) - np.array(spec.low)
+        self.register_buffer("centre", torch.as_tensor((lower + upper) / 2, dtype=torch.float32))
         self.register_buffer(
-            "spread", torch.as_tensor(np.maximum(last - first, MIN_SPAN * allowed) / 2, dtype=torch.float32)
+            "spread", torch.as_tensor(np.maximum(upper - lower, MIN_SPAN * allowed_span) / 2, dtype=torch.float32)
         )
         self.register_buffer("basis", cosines(chunk), persistent=False)
-        self._least, self._most = 0, 0  # coefficients
+        self._minimum, self._maximum = 0, 0  # coefficients
         self._bpe, self._pieces = Tokenizer(BPE()), [""]
         if statistics is not None:
             self._fit(torch.from_numpy(np.ascontiguousarray(sample, np.float32)))
@@ -81,10 +81,10 @@ class Fast(ActionTokenizer):
     @torch.compiler.disable
     def tokenize(self, actions: Tensor) -> Tensor:
         """Encode (…, k, D) float chunks, clipped to the bounds, as (…, L) int64 tokens, padded with the end token."""
-        texts = self._texts(self._round(actions).clamp(self._least, self._most))  # to the alphabet
-        encoded = [encoding.ids for encoding in self._bpe.encode_batch(texts, add_special_tokens=False)]
-        length = 1 + max(len(ids) for ids in encoded)
-        rows = [ids + [self.end] * (length - len(ids)) for ids in encoded]
+        texts = self._texts(self._round(actions).clamp(self._minimum, self._maximum))  # to the alphabet
+        token_ids = [encoding.ids for encoding in self._bpe.encode_batch(texts, add_special_tokens=False)]
+        length = 1 + max(len(ids) for ids in token_ids)
+        rows = [ids + [self.end] * (length - len(ids)) for ids in token_ids]
         return torch.tensor(rows, device=actions.device).view(*actions.shape[:-2], length)
 
     @torch.compiler.disable
@@ -95,7 +95,7 @@ class Fast(ActionTokenizer):
         for ids in tokens.reshape(-1, tokens.shape[-1]).tolist():
             ids = ids[: ids.index(self.end)] if self.end in ids else ids
             text = "".join(self._pieces[token] for token in ids if token < len(self._pieces))[:count]
-            values = [ord(character) - FIRST_CODE_POINT + self._least for character in text]
+            values = [ord(character) - FIRST_CODE_POINT + self._minimum for character in text]
             rows.append(values + [0] * (count - len(values)))
         coefficients = torch.tensor(rows, dtype=torch.float32, device=tokens.device)
         scaled = exact_product(self.basis.T, coefficients.view(-1, self.chunk, self.components)) / self.scale
@@ -106,21 +106,21 @@ class Fast(ActionTokenizer):
 
         Every token depends on all actions of a chunk, including those that repeat the last one of an episode.
         """
-        ended = (tokens == self.end).cumsum(-1)
-        whole = perturbations.amax(-1) == 0
-        return ((ended == 0) | ((ended == 1) & (tokens == self.end))) & whole[..., None]
+        end_counts = (tokens == self.end).cumsum(-1)
+        unperturbed = perturbations.amax(-1) == 0
+        return ((end_counts == 0) | ((end_counts == 1) & (tokens == self.end))) & unperturbed[..., None]
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the fitted values that are not tensors, for the checkpoint."""
-        return {"coefficients": [self._least, self._most], "bpe": self._bpe.to_str()}
+        return {"coefficients": [self._minimum, self._maximum], "bpe": self._bpe.to_str()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the fitted values; a UserError if they are damaged."""
         if type(state).__name__ == "_EXTRA_STATE":  # PyTorch's placeholder in sharded models, with nothing to load
             return
         try:
-            self._least, self._most = map(int, state["coefficients"])
-            if not (abs(self._least) < 2**31 and 0 <= self._most - self._least < MOST_VALUES):
+            self._minimum, self._maximum = map(int, state["coefficients"])
+            if not (abs(self._minimum) < 2**31 and 0 <= self._maximum - self._minimum < MOST_VALUES):
                 raise ValueError("its coefficients are no range that there are characters for")
             self._set_bpe(Tokenizer.from_str(state["bpe"]))
         except Exception as error:  # tokenizers raises a plain Exception for invalid text
@@ -128,14 +128,14 @@ class Fast(ActionTokenizer):
 
     def _fit(self, chunks: Tensor) -> None:
         coefficients = self._round(chunks)
-        self._least, self._most = int(coefficients.min()), int(coefficients.max())
-        values = self._most - self._least + 1
-        if values > (most := min(self.bins - 1, MOST_VALUES)):
+        self._minimum, self._maximum = int(coefficients.min()), int(coefficients.max())
+        count = self._maximum - self._minimum + 1
+        if count > (limit := min(self.bins - 1, MOST_VALUES)):
             raise UserError(
-                f"the coefficients take {values} values, and tokenizer.bins={self.bins} can tell {most} apart: "
+                f"the coefficients take {count} values, and tokenizer.bins={self.bins} can tell {limit} apart: "
                 f"raise it, or lower tokenizer.scale={self.scale}"
             )
-        alphabet = [chr(FIRST_CODE_POINT + number) for number in range(values)]
+        alphabet = [chr(FIRST_CODE_POINT + number) for number in range(count)]
         bpe = Tokenizer(BPE())
         trainer = BpeTrainer(vocab_size=self.bins, special_tokens=[END], initial_alphabet=alphabet, show_progress=False)
         bpe.train_from_iterator(self._texts(coefficients), trainer)
@@ -153,12 +153,12 @@ class Fast(ActionTokenizer):
 
         Less than full precision would change some coefficients.
         """
-        inside = actions.clamp(self.low, self.high)
-        return (exact_product(self.basis, (inside - self.centre) / self.spread) * self.scale).round()
+        clipped_actions = actions.clamp(self.low, self.high)
+        return (exact_product(self.basis, (clipped_actions - self.centre) / self.spread) * self.scale).round()
 
     def _texts(self, coefficients: Tensor) -> list[str]:
         """Convert (…, k, D) coefficients to one text of k·D characters per chunk."""
-        codes = (coefficients - self._least + FIRST_CODE_POINT).long().reshape(-1, self.chunk * self.components)
+        codes = (coefficients - self._minimum + FIRST_CODE_POINT).long().reshape(-1, self.chunk * self.components)
         return ["".join(map(chr, row)) for row in codes.tolist()]
 
 

@@ -33,18 +33,18 @@ class Quantile(PerComponent):
         low, high = data_bounds(spec, statistics)
         super().__init__(spec, low, high, bins)
         sample = np.linspace(low, high, 2 * bins + 1) if statistics is None else statistics.chunks(1)[:, 0]
-        fitted = [_bins(values, bins) for values in np.sort(np.asarray(sample, np.float64), axis=0).T]
-        unused = self.high + (self.high - self.low)
-        self.register_buffer("edges", unused[:, None].repeat(1, bins - 1))
+        edges_and_centres = [_bins(values, bins) for values in np.sort(np.asarray(sample, np.float64), axis=0).T]
+        unused_edge = self.high + (self.high - self.low)
+        self.register_buffer("edges", unused_edge[:, None].repeat(1, bins - 1))
         self.register_buffer("centres", self.high[:, None].repeat(1, bins))
-        for index, (edges, centres) in enumerate(fitted):
+        for index, (edges, centres) in enumerate(edges_and_centres):
             self.edges[index, : len(edges)] = torch.from_numpy(edges)
             self.centres[index, : len(centres)] = torch.from_numpy(centres)
 
     def encode(self, action: Tensor) -> Tensor:
         """Encode (…, D) float actions as their bins, (…, D) int64."""
-        inside = action.clamp(self.low, self.high)
-        columns = inside.reshape(-1, self.components).T.contiguous()  # (D, N)
+        clipped_action = action.clamp(self.low, self.high)
+        columns = clipped_action.reshape(-1, self.components).T.contiguous()  # (D, N)
         return torch.searchsorted(self.edges, columns, right=True).T.reshape(action.shape)
 
     def decode(self, token: Tensor) -> Tensor:
@@ -56,7 +56,7 @@ def _bins(values: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray]:
     """Return edges and means of at most `bins` bins of the (N,) ascending `values`."""
     starts = np.arange(1, bins) * len(values) // bins
     # A bin starts at the first occurrence of its value. Edges lie midway between values, where rounding has no effect.
-    first = np.unique(values.searchsorted(values[starts]))
-    first = first[first > 0]
-    edges = (values[first - 1] + values[first]) / 2
-    return edges, np.array([part.mean() for part in np.split(values, first)])
+    bin_starts = np.unique(values.searchsorted(values[starts]))
+    bin_starts = bin_starts[bin_starts > 0]
+    edges = (values[bin_starts - 1] + values[bin_starts]) / 2
+    return edges, np.array([part.mean() for part in np.split(values, bin_starts)])

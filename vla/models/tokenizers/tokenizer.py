@@ -59,9 +59,9 @@ class ActionTokenizer(nn.Module, ABC):
     def __init__(self, spec: Spec, low: np.ndarray, high: np.ndarray, bins: Bins) -> None:
         super().__init__()
         ranges = zip(spec.action, spec.low, spec.high, strict=True)
-        empty = [name for name, least, largest in ranges if not (least < largest and math.isfinite(largest - least))]
-        if empty:
-            raise UserError(f"the spec must give {', '.join(empty)} finite bounds, with low below high")
+        names = [name for name, lower, upper in ranges if not (lower < upper and math.isfinite(upper - lower))]
+        if names:
+            raise UserError(f"the spec must give {', '.join(names)} finite bounds, with low below high")
         self.bins, self.components = bins, len(spec.action)
         self.register_buffer("low", torch.as_tensor(low, dtype=torch.float32))
         self.register_buffer("high", torch.as_tensor(high, dtype=torch.float32))
@@ -154,8 +154,8 @@ class EvenBins(PerComponent):
 
     def _position(self, action: Tensor) -> Tensor:
         """Return the fractional token, 0 … K - 1, of (…, D) actions clipped to the bounds."""
-        inside = action.clamp(self.low, self.high)
-        return (inside - self.low) / (self.high - self.low) * (self.bins - 1)
+        clipped_action = action.clamp(self.low, self.high)
+        return (clipped_action - self.low) / (self.high - self.low) * (self.bins - 1)
 
 
 class Uniform(EvenBins):
@@ -210,8 +210,8 @@ class Uniform(EvenBins):
         window = 2 * self.reach + 1
         weight = F.avg_pool1d(probabilities.flatten(0, -2), window, stride=1, padding=self.reach).view_as(logits)
         bins = self._bins(logits)
-        near = probabilities * ((bins - weight.argmax(-1, keepdim=True)).abs() <= self.reach)
-        return self.decode((near * bins).sum(-1) / near.sum(-1))
+        peak = probabilities * ((bins - weight.argmax(-1, keepdim=True)).abs() <= self.reach)
+        return self.decode((peak * bins).sum(-1) / peak.sum(-1))
 
     def _bins(self, logits: Tensor) -> Tensor:
         return torch.arange(self.bins, device=logits.device, dtype=torch.float32)
@@ -229,9 +229,9 @@ class RT1Bins(EvenBins):
     """
 
     def __init__(self, bins: Bins, *, spec: Spec, statistics: ActionStatistics | None = None) -> None:
-        unknown = sorted(set(spec.units) - set(RT1_BOUNDS))
-        if unknown:
-            raise UserError(f"tokenizer=rt1 takes actions in {', '.join(RT1_BOUNDS)}, not in {', '.join(unknown)}")
+        other_units = sorted(set(spec.units) - set(RT1_BOUNDS))
+        if other_units:
+            raise UserError(f"tokenizer=rt1 takes actions in {', '.join(RT1_BOUNDS)}, not in {', '.join(other_units)}")
         bound = np.array([RT1_BOUNDS[unit] for unit in spec.units])
         super().__init__(spec, -bound, bound, bins)
 
@@ -256,8 +256,8 @@ def data_bounds(spec: Spec, statistics: ActionStatistics | None, margin: float =
             f"{', '.join(spec.action)}"
         )
     span = np.maximum(high - low, MIN_SPAN * (allowed_high - allowed_low))
-    half = (0.5 + margin) * span
-    return (low + high) / 2 - half, (low + high) / 2 + half
+    half_span = (0.5 + margin) * span
+    return (low + high) / 2 - half_span, (low + high) / 2 + half_span
 
 
 def out_of_bounds(tokenizer: ActionTokenizer, chunks: np.ndarray) -> float:
@@ -271,8 +271,8 @@ def rounding(tokenizer: ActionTokenizer, chunks: np.ndarray, spec: Spec) -> tupl
     actions = torch.from_numpy(np.array(chunks, np.float32))
     error = (tokenizer.detokenize(tokenizer.tokenize(actions)) - actions).abs().mean((0, 1)).numpy()  # (D,)
     span = np.maximum(chunks.max((0, 1)) - chunks.min((0, 1)), MIN_SPAN * (np.array(spec.high) - np.array(spec.low)))
-    worst = int((error / span).argmax())
-    return spec.action[worst], float(error[worst] / span[worst])
+    worst_index = int((error / span).argmax())
+    return spec.action[worst_index], float(error[worst_index] / span[worst_index])
 
 
 def _hard_cross_entropy(logits: Tensor, token: Tensor) -> Tensor:

@@ -123,8 +123,8 @@ class FilmConv(ImageEncoder):
             x = F.silu(film(conv(x), text))
         if self.positions:
             height, width = x.shape[-2:]
-            where = (POSITION_SCALE * grid(x)).to(x.dtype).T.view(1, 2, height, width)
-            x = torch.cat([x, where.expand(len(x), -1, -1, -1)], 1)
+            coordinates = (POSITION_SCALE * grid(x)).to(x.dtype).T.view(1, 2, height, width)
+            x = torch.cat([x, coordinates.expand(len(x), -1, -1, -1)], 1)
         return x
 
 
@@ -227,16 +227,16 @@ class RandomShift(nn.Module):
             return rgb
         images = [*rgb.values()]
         clips, frames, height, width, _ = images[0].shape
-        up, left = round(self.vertical * height / 256), round(self.horizontal * height / 256)
-        tall, wide = height + 2 * up, width + 2 * left
-        padded = images[0].new_zeros(len(rgb), clips, frames, tall, wide, 3)
+        top, left = round(self.vertical * height / 256), round(self.horizontal * height / 256)
+        padded_height, padded_width = height + 2 * top, width + 2 * left
+        padded = images[0].new_zeros(len(rgb), clips, frames, padded_height, padded_width, 3)
         for target, values in zip(padded, images, strict=True):
-            target[:, :, up : up + height, left : left + width] = values
+            target[:, :, top : top + height, left : left + width] = values
         device = padded.device
-        offsets = [torch.randint(2 * most + 1, (clips,), device=device) for _ in rgb for most in (up, left)]
+        offsets = [torch.randint(2 * margin + 1, (clips,), device=device) for _ in rgb for margin in (top, left)]
         row, column = torch.stack(offsets).view(len(rgb), 2, clips, 1, 1).unbind(1)  # (cameras, B, 1, 1) each
-        first = tall * torch.arange(len(rgb) * clips * frames, device=device).view(len(rgb), clips, frames, 1)
-        starts = (first + row + torch.arange(height, device=device)) * wide + column  # of rows [px]
+        origin = padded_height * torch.arange(len(rgb) * clips * frames, device=device).view(len(rgb), clips, frames, 1)
+        starts = (origin + row + torch.arange(height, device=device)) * padded_width + column  # of rows [px]
         runs = padded.flatten().unfold(0, 3 * width, 3)  # a row's length of pixels from every pixel on, without a copy
         shifted = runs.index_select(0, starts.flatten()).view(len(rgb), *images[0].shape)
         return dict(zip(rgb, shifted, strict=True))

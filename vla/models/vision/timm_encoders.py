@@ -113,15 +113,15 @@ class FilmBackbone(ImageEncoder):
         super().__init__(channels)
         self.backbone = load_backbone(name, pretrained, size=size)
         self.backbone.prune_intermediate_layers(1, prune_norm=False, prune_head=True)
-        last = self.backbone.feature_info[-1]
-        if size is not None and size % last["reduction"]:
-            raise UserError(f"model.image.size={size} must be a multiple of {last['reduction']} px for {name}")
+        stage = self.backbone.feature_info[-1]
+        if size is not None and size % stage["reduction"]:
+            raise UserError(f"model.image.size={size} must be a multiple of {stage['reduction']} px for {name}")
         self.size = size or self.backbone.pretrained_cfg["input_size"][-1]
         self.frozen = frozen
         self.normalized = "hiera" not in name  # the only family without a normalisation of feature maps
         self.backbone.requires_grad_(not frozen).train(not frozen)  # Lightning keeps the mode that it finds
         self.normalize = Normalize(self.backbone)
-        self.projection = nn.Conv2d(last.get("num_chs_norm", last["num_chs"]), channels, 1, bias=False)
+        self.projection = nn.Conv2d(stage.get("num_chs_norm", stage["num_chs"]), channels, 1, bias=False)
         self.film = FiLM(text_width, channels, identity=True)
 
     def train(self, mode: bool = True) -> FilmBackbone:
@@ -151,26 +151,26 @@ def load_backbone(name: str, pretrained: Pretrained, size: int | None = None) ->
     """
     import timm  # slow to import, not needed by every policy
 
-    known = [*timm.list_models(), *timm.list_pretrained()]
-    if name not in known:
-        raise UserError(f"model.image.name={name} is no network of timm{suggestion(name, known)}")
+    names = [*timm.list_models(), *timm.list_pretrained()]
+    if name not in names:
+        raise UserError(f"model.image.name={name} is no network of timm{suggestion(name, names)}")
     config: Any = timm.get_pretrained_cfg(name)
     options: dict[str, Any] = {"num_classes": 0, "img_size": size if config.fixed_input_size else None}
     path = _weights_file(name, config.hf_hub_id, pretrained)
     if path is None:
         return timm.create_model(name, **options)
     classifiers = (config.classifier,) if isinstance(config.classifier, str) else config.classifier or ()
-    prefixes = tuple(f"{each}." for each in classifiers)
+    prefixes = tuple(f"{classifier}." for classifier in classifiers)
     # Without a classifier in network and file, timm loads the weights strictly.
-    weights = {key: value for key, value in _read(path, name).items() if not key.startswith(prefixes)}
+    weights = {key: value for key, value in _read_weights(path, name).items() if not key.startswith(prefixes)}
     overlay = {"state_dict": weights, "classifier": None, "num_classes": 0}
     try:
         net: Any = timm.create_model(name, pretrained=True, pretrained_cfg_overlay=overlay, **options)
     except RuntimeError as error:
         raise UserError(f"{path} does not hold the weights of timm's {name}: {lines_of(error)[-1]}") from error
     del net.pretrained_cfg["state_dict"]
-    found = pretrained if isinstance(pretrained, str) and pretrained != "auto" else config.hf_hub_id or f"timm/{name}"
-    net.source = Source.of(path, pretrained.source if isinstance(pretrained, PackagedFile) else found)
+    origin = pretrained if isinstance(pretrained, str) and pretrained != "auto" else config.hf_hub_id or f"timm/{name}"
+    net.source = Source.of(path, pretrained.source if isinstance(pretrained, PackagedFile) else origin)
     log.info("%s: weights loaded from %s", name, path)
     return net
 
@@ -178,8 +178,8 @@ def load_backbone(name: str, pretrained: Pretrained, size: int | None = None) ->
 def _weights_file(name: str, repository: str | None, pretrained: Pretrained) -> Path | None:
     """Return the file of the initial weights, downloaded if necessary; None for random initialisation."""
     if isinstance(pretrained, PackagedFile):
-        found = pretrained.locate(WEIGHTS)
-        return found / WEIGHTS if found.is_dir() else found
+        path = pretrained.locate(WEIGHTS)
+        return path / WEIGHTS if path.is_dir() else path
     if not pretrained:
         return None
     if isinstance(pretrained, str) and pretrained != "auto":
@@ -198,7 +198,7 @@ def _weights_file(name: str, repository: str | None, pretrained: Pretrained) -> 
         return None
 
 
-def _read(path: Path, name: str) -> dict[str, Tensor]:
+def _read_weights(path: Path, name: str) -> dict[str, Tensor]:
     """Read the weights of the network `name`; of a pickle only tensors are read.
 
     Weights of efficientnet_pytorch get timm's names: both packages register their layers in the order of execution, so
@@ -208,7 +208,7 @@ def _read(path: Path, name: str) -> dict[str, Tensor]:
 
     try:
         weights: dict[str, Tensor] = timm.models.load_state_dict(str(path), use_ema=False, weights_only=True)
-        if not weights or not all(isinstance(each, Tensor) for each in weights.values()):
+        if not weights or not all(isinstance(weight, Tensor) for weight in weights.values()):
             raise ValueError
     except Exception as error:  # a pickle can raise nearly anything
         raise UserError(f"{path} cannot be read as weights: it is damaged or of another kind") from error

@@ -51,7 +51,7 @@ class LeRobotPolicyExporter:
             raise UserError(f"LeRobot has no {type(model).__name__}: this export is for model=smolvla, pi0 and pi05")
         if model.text.name is None:
             raise UserError("LeRobot needs a tokenizer, and this policy has none: train with model.text.name=FOLDER")
-        beginnings = [(ours, theirs) for theirs, ours in model.network.published]
+        beginnings = [(own_prefix, published_prefix) for published_prefix, own_prefix in model.network.published]
         state = model.network.state_dict()
         weights = {renamed(name, beginnings): tensor.detach().cpu().contiguous() for name, tensor in state.items()}
         # No action depends on these, but LeRobot's π0 and π0.5 report a failure to load if one is missing.
@@ -63,8 +63,8 @@ class LeRobotPolicyExporter:
             try:
                 save_file(weights, draft / "model.safetensors")
             except SafetensorError as error:
-                where = "make room there, or choose another export.folder"
-                raise UserError(f"{self._folder} cannot be written ({error}): {where}") from error
+                remedy = "make room there, or choose another export.folder"
+                raise UserError(f"{self._folder} cannot be written ({error}): {remedy}") from error
             write_json(draft / CONFIG, config)
             for file, pipeline in zip((PREPROCESSOR, POSTPROCESSOR), steps, strict=True):
                 for step in pipeline:
@@ -77,15 +77,15 @@ class LeRobotPolicyExporter:
 def _config(model: VisionLanguageAction) -> dict[str, Any]:
     inputs, outputs = _features(model)
     network, mode = model.network, MODES[model.action_normalizer.kind]
-    of_smolvla = network.kind == "smolvla"
-    if model.place != ("corner" if of_smolvla else "centre"):
+    is_smolvla = network.kind == "smolvla"
+    if model.place != ("corner" if is_smolvla else "centre"):
         raise UserError(f"LeRobot's {network.kind} places non-square images differently: train without model.place")
     if model.text.state != (in_sentence := not network.state_width):
         raise UserError(
             f"LeRobot's {network.kind} has {'the' if in_sentence else 'no'} state in the sentence: train with "
             f"model.text.state={str(in_sentence).lower()}"
         )
-    own = {"vlm_model_name": _tokenizer(model), "num_steps": model.steps}
+    smolvla_options = {"vlm_model_name": _tokenizer(model), "num_steps": model.steps}
     return {
         "type": network.kind,
         "input_features": inputs,
@@ -97,7 +97,7 @@ def _config(model: VisionLanguageAction) -> dict[str, Any]:
         "max_action_dim": network.action_width,
         "tokenizer_max_length": model.text.length,
         **network.options(),
-        **(own if of_smolvla else {"num_inference_steps": model.steps}),
+        **(smolvla_options if is_smolvla else {"num_inference_steps": model.steps}),
     }
 
 

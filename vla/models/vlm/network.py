@@ -66,9 +66,9 @@ class WithKeys(nn.Module):
 
     def forward(self, hidden: Tensor, others: tuple[Tensor, Tensor] | None = None, **attention: Any) -> Layered:
         """Process (B, N, E) tokens, which attend to preceding tokens too, given the keys and values of these."""
-        own, layer = Own(others), super()
-        hidden = layer.forward(hidden, past_key_values=own, **attention)
-        return hidden, own.keys, own.values
+        cache, layer = Own(others), super()
+        hidden = layer.forward(hidden, past_key_values=cache, **attention)
+        return hidden, cache.keys, cache.values
 
 
 class LastLayer(nn.Module):
@@ -217,9 +217,9 @@ class FlowNetwork(nn.Module, ABC):
 
 def renamed(name: str, beginnings: Iterable[tuple[str, str]]) -> str:
     """Return a published name as it is here, given pairs of how names begin there and here."""
-    for theirs, ours in beginnings:
-        if name.startswith(theirs):
-            return ours + name.removeprefix(theirs)
+    for published_prefix, own_prefix in beginnings:
+        if name.startswith(published_prefix):
+            return own_prefix + name.removeprefix(published_prefix)
     return name
 
 

@@ -47,15 +47,15 @@ class Normalizer(nn.Module):
         The extremes of a component that rarely changes, such as a gripper, take the place of its percentiles, or its
         changes would be huge. One that never changes gets `constant` as its standard deviation, or half its range.
         """
-        least, most = values.min(0), values.max(0)
-        spread = np.where(most - least > CONSTANT, 0.0, constant)
+        minimum, maximum = values.min(0), values.max(0)
+        spread = np.where(maximum - minimum > CONSTANT, 0.0, constant)
         if self.kind == "mean_std":
-            fitted = values.mean(0, dtype=np.float64), values.std(0, dtype=np.float64) + spread
+            estimates = values.mean(0, dtype=np.float64), values.std(0, dtype=np.float64) + spread
         else:
             low, high = np.quantile(values, (0.01, 0.99), axis=0)
-            rare = high - low <= RARE * (most - least)
-            fitted = np.where(rare, least, low) - spread, np.where(rare, most, high) + spread
-        for name, value in zip(self.statistics, fitted, strict=True):
+            rare = high - low <= RARE * (maximum - minimum)
+            estimates = np.where(rare, minimum, low) - spread, np.where(rare, maximum, high) + spread
+        for name, value in zip(self.statistics, estimates, strict=True):
             getattr(self, name).copy_(torch.from_numpy(value))
 
     def take(self, statistics: Mapping[str, Tensor], feature: str, source: object) -> None:
@@ -65,13 +65,13 @@ class Normalizer(nn.Module):
             UserError: they lack the feature, or have another width.
         """
         for name in self.statistics:
-            own, found = getattr(self, name), statistics.get(f"{feature}.{name}")
-            if found is None:
+            buffer, published_values = getattr(self, name), statistics.get(f"{feature}.{name}")
+            if published_values is None:
                 raise UserError(f"{source} has no statistics {feature}.{name}: choose model.statistics=demonstrations")
-            if found.shape != own.shape:
-                sizes = f"{found.numel()} components, not of {own.numel()}"
+            if published_values.shape != buffer.shape:
+                sizes = f"{published_values.numel()} components, not of {buffer.numel()}"
                 raise UserError(f"{source} has {feature}.{name} of {sizes}: choose model.statistics=demonstrations")
-            own.copy_(found)
+            buffer.copy_(published_values)
 
     def forward(self, values: Tensor) -> Tensor:
         """Normalise (…, W) values."""

@@ -27,27 +27,27 @@ class PackedLinear(nn.Linear):
 
     def forward(self, input: Tensor) -> Tensor:
         """Map (…, inputs) to (…, outputs)."""
-        return super().forward(input) if self._plain(input) else self._packed(input, "none", "")
+        return super().forward(input) if self._is_plain(input) else self._forward_packed(input, "none", "")
 
     def gelu(self, input: Tensor) -> Tensor:
         """Map (…, inputs) to (…, outputs), followed by GELU with its approximation by tanh."""
-        if self._plain(input):
+        if self._is_plain(input):
             return F.gelu(super().forward(input), approximate="tanh")
-        return self._packed(input, "gelu", "tanh")
+        return self._forward_packed(input, "gelu", "tanh")
 
-    def _plain(self, input: Tensor) -> bool:
+    def _is_plain(self, input: Tensor) -> bool:
         if torch.compiler.is_compiling() or not torch.is_inference_mode_enabled():  # the latter cannot be traced
             return True
-        known = input.device.type == "cpu" and self.weight.dtype == torch.float32
-        return not known or torch.is_autocast_enabled("cpu")
+        is_supported = input.device.type == "cpu" and self.weight.dtype == torch.float32
+        return not is_supported or torch.is_autocast_enabled("cpu")
 
-    def _packed(self, input: Tensor, then: str, how: str) -> Tensor:
+    def _forward_packed(self, input: Tensor, activation: str, approximation: str) -> Tensor:
         key = self.weight.data_ptr(), self.weight._version
-        packed = PACKED.get(self)
-        if packed is None or packed[0] != key:
+        entry = PACKED.get(self)
+        if entry is None or entry[0] != key:
             rows = input.numel() // self.in_features
-            packed = PACKED[self] = key, torch.ops.mkldnn._reorder_linear_weight(self.weight.detach(), rows)
-        return torch.ops.mkldnn._linear_pointwise(input, packed[1], self.bias, then, [], how)
+            entry = PACKED[self] = key, torch.ops.mkldnn._reorder_linear_weight(self.weight.detach(), rows)
+        return torch.ops.mkldnn._linear_pointwise(input, entry[1], self.bias, activation, [], approximation)
 
 
 class PackedMLP(nn.Module):
@@ -67,8 +67,8 @@ def pack(network: nn.Module) -> None:
         return
     for module in network.modules():
         if type(module) is nn.Linear:
-            changed: Any = module
-            changed.__class__ = PackedLinear
+            layer: Any = module
+            layer.__class__ = PackedLinear
         elif type(module) in (SiglipMLP, SmolVLMVisionMLP) and isinstance(module.activation_fn, GELUTanh):
-            changed = module
-            changed.__class__ = PackedMLP
+            layer = module
+            layer.__class__ = PackedMLP

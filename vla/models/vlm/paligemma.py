@@ -45,7 +45,7 @@ class PaliGemmaWithExpert(FlowNetwork):
     All query heads share one key-value head, and every patch becomes a token.
     """
 
-    published = tuple((f"{head}{there}", here) for head in HEADS for there, here in NAMES)
+    published = tuple((f"{head}{prefix}", own_prefix) for head in HEADS for prefix, own_prefix in NAMES)
     pretrained = TRUNK
     unused = tuple(f"{head}paligemma_with_expert.gemma_expert.lm_head." for head in HEADS)
 
@@ -64,10 +64,10 @@ class PaliGemmaWithExpert(FlowNetwork):
 
     def prefix(self, images: Tensor, cameras: Tensor, tokens: Tensor, sentence: Tensor, state: Tensor | None) -> Prefix:
         """Encode images and sentence; absent tokens are masked, and positions do not count them."""
-        seen = self.paligemma.get_image_features(images.flatten(0, 1)).pooler_output.unflatten(0, images.shape[:2])
-        read = self.paligemma.language_model.embed_tokens(tokens)  # which scales by the square root of its width
-        present = torch.cat([cameras.repeat_interleave(seen.shape[2], 1), sentence], 1)
-        hidden = torch.cat([seen.flatten(1, 2), read], 1)
+        patches = self.paligemma.get_image_features(images.flatten(0, 1)).pooler_output.unflatten(0, images.shape[:2])
+        words = self.paligemma.language_model.embed_tokens(tokens)  # which scales by the square root of its width
+        present = torch.cat([cameras.repeat_interleave(patches.shape[2], 1), sentence], 1)
+        hidden = torch.cat([patches.flatten(1, 2), words], 1)
         return self.attend(self.paligemma.language_model, hidden, present, None)[1]
 
     def attend(
@@ -85,14 +85,14 @@ class PaliGemmaWithExpert(FlowNetwork):
         Returns:
             The tokens, (B, N, E), not normalised, and their keys and values as a prefix.
         """
-        everything = present if prefix is None else torch.cat([prefix.present, present], 1)  # (B, P + N)
-        positions = everything.cumsum(1)[:, -hidden.shape[1] :] - 1
+        key_mask = present if prefix is None else torch.cat([prefix.present, present], 1)  # (B, P + N)
+        positions = key_mask.cumsum(1)[:, -hidden.shape[1] :] - 1
         rotation = self.paligemma.language_model.rotary_emb(hidden, positions)
-        mask = everything[:, None, None, :].expand(-1, 1, hidden.shape[1], -1)
+        mask = key_mask[:, None, None, :].expand(-1, 1, hidden.shape[1], -1)
         keys, values = [], []
         for number, layer in enumerate(gemma.layers):
-            others = None if prefix is None else (prefix.keys[number], prefix.values[number])
-            attention = {"attention_mask": mask, "position_embeddings": rotation, "others": others}
+            pair = None if prefix is None else (prefix.keys[number], prefix.values[number])
+            attention = {"attention_mask": mask, "position_embeddings": rotation, "others": pair}
             hidden, own_keys, own_values = layer(hidden, **attention, **condition)
             keys.append(own_keys)
             values.append(own_values)
@@ -122,7 +122,7 @@ def _expert(sizes: dict[str, int]) -> GemmaModel:
 def joined(first: Prefix, second: Prefix) -> Prefix:
     """Concatenate two prefixes."""
     keys, values = (
-        tuple(torch.cat(pair, 2) for pair in zip(*both, strict=True))
-        for both in ((first.keys, second.keys), (first.values, second.values))
+        tuple(torch.cat(pair, 2) for pair in zip(*layers, strict=True))
+        for layers in ((first.keys, second.keys), (first.values, second.values))
     )
     return Prefix(keys, values, torch.cat([first.present, second.present], 1))

@@ -33,9 +33,9 @@ class PI0(PaliGemmaWithExpert):
     def prefix(self, images: Tensor, cameras: Tensor, tokens: Tensor, sentence: Tensor, state: Tensor | None) -> Prefix:
         """Encode images and sentence, then the state in the expert, where it attends to them but not to actions."""
         assert state is not None
-        known = super().prefix(images, cameras, tokens, sentence, None)
+        trunk_prefix = super().prefix(images, cameras, tokens, sentence, None)
         token = self.state_proj(state).unsqueeze(1)
-        return joined(known, self.attend(self.expert, token, sentence.new_ones(len(token), 1), known)[1])
+        return joined(trunk_prefix, self.attend(self.expert, token, sentence.new_ones(len(token), 1), trunk_prefix)[1])
 
     def velocity(self, prefix: Prefix, noisy: Tensor, time: Tensor) -> Tensor:
         """Predict the velocity of (B, k, A) noisy actions at times (B,) or (B, k)."""

@@ -26,12 +26,12 @@ class PI05(PaliGemmaWithExpert):
     def __init__(self, **inherited: Inherited) -> None:
         super().__init__(**inherited)
         config = self.expert.config
-        width, layers = config.hidden_size, range(config.num_hidden_layers)
-        made = [AdaptiveLayer(config, number) for number in layers]
-        for layer in made:
+        width, numbers = config.hidden_size, range(config.num_hidden_layers)
+        layers = [AdaptiveLayer(config, number) for number in numbers]
+        for layer in layers:
             layer.self_attn.apply(self.expert._init_weights)
             layer.mlp.apply(self.expert._init_weights)
-        self.expert.layers = nn.ModuleList(made)
+        self.expert.layers = nn.ModuleList(layers)
         self.expert.norm = AdaptiveNorm(width, config.rms_norm_eps)
         self.time_mlp_in, self.time_mlp_out = nn.Linear(width, width), nn.Linear(width, width)
 
@@ -87,8 +87,8 @@ class AdaptiveLayer(nn.Module):
         self, hidden: Tensor, condition: Tensor, others: tuple[Tensor, Tensor] | None, **attention: Any
     ) -> Layered:
         """Process (B, N, E) tokens, given the condition of the norms, and keys and values of preceding tokens."""
-        own = Own(others)
+        cache = Own(others)
         normal, gate = self.input_layernorm(hidden, condition)
-        hidden = hidden + self.self_attn(normal, past_key_values=own, **attention)[0] * gate
+        hidden = hidden + self.self_attn(normal, past_key_values=cache, **attention)[0] * gate
         normal, gate = self.post_attention_layernorm(hidden, condition)
-        return hidden + self.mlp(normal) * gate, own.keys, own.values
+        return hidden + self.mlp(normal) * gate, cache.keys, cache.values

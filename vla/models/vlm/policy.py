@@ -100,7 +100,7 @@ class VisionLanguageAction(Model):
         require_prefix(prefix, self.execute, chunk)
         origin = None if trunk is None else Trunk(trunk)
         self.cameras = _cameras(cameras, spec, origin)
-        self.network = origin.build(network) if origin else _random(network)
+        self.network = origin.build(network) if origin else _random_network(network)
         if self.text.name is None and self.network.vocabulary < WORDS:
             raise UserError(
                 f"model.network.vocabulary={self.network.vocabulary} is less than the {WORDS} words of a prompt "
@@ -113,9 +113,9 @@ class VisionLanguageAction(Model):
         self.state_normalizer = Normalizer(normalization, len(spec.pose))
         self.action_normalizer = Normalizer(normalization, len(spec.action))
         if statistics == "pretrained" and origin:
-            known = origin.statistics(normalization)
-            self.state_normalizer.take(known, "observation.state", trunk)
-            self.action_normalizer.take(known, "action", trunk)
+            trunk_statistics = origin.statistics(normalization)
+            self.state_normalizer.take(trunk_statistics, "observation.state", trunk)
+            self.action_normalizer.take(trunk_statistics, "action", trunk)
         size = (chunk, self.network.action_width)
         noise = torch.randn(size, generator=torch.Generator().manual_seed(0))
         self.register_buffer("noise", noise, persistent=False)
@@ -150,11 +150,11 @@ class VisionLanguageAction(Model):
 
         Outside training they have a fixed seed.
         """
-        how, count = random_arguments(self.training, self.noise.device), self.copies * len(batch["state"])
-        noise = torch.randn(count, *self.noise.shape, **how)
-        uniform = torch.rand(count, **how)
+        options, count = random_arguments(self.training, self.noise.device), self.copies * len(batch["state"])
+        noise = torch.randn(count, *self.noise.shape, **options)
+        uniform = torch.rand(count, **options)
         time = MIN_TIME + (1 - MIN_TIME) * uniform ** (1 / SHAPE)  # uniform ** (2 / 3) ~ Beta(1.5, 1)
-        length = torch.randint(self.prefix + 1, (count,), **how).to(self.noise.device)
+        length = torch.randint(self.prefix + 1, (count,), **options).to(self.noise.device)
         return {**batch, "noise": noise.to(self.noise), "time": time.to(self.noise), "length": length}
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
@@ -164,8 +164,8 @@ class VisionLanguageAction(Model):
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return velocity and target, (R·B, k, A) each; with an auxiliary head also truth: (B, 1, S), normalised."""
         copies = len(batch["time"]) // len(batch["state"])
-        known = self.known(batch)
-        prefix = repeated(known, copies)
+        prefix = self.known(batch)
+        prefixes = repeated(prefix, copies)
         action = self.scaled(batch["action"][:, -1]).repeat(copies, 1, 1)
         noise, time = batch["noise"], batch["time"]
         noisy = time[:, None, None] * noise + (1 - time)[:, None, None] * action
@@ -173,8 +173,8 @@ class VisionLanguageAction(Model):
             executed = self.scaled(batch["executed"][:, -1]).repeat(copies, 1, 1)
             noisy, progress = with_prefix(noisy, 1 - time, executed, batch["length"])
             time = 1 - progress
-        truth = self.predict_truth(last_of(known).unsqueeze(1))
-        return {"velocity": self.network.velocity(prefix, noisy, time), "target": noise - action, **truth}
+        truth = self.predict_truth(last_of(prefix).unsqueeze(1))
+        return {"velocity": self.network.velocity(prefixes, noisy, time), "target": noise - action, **truth}
 
     def scaled(self, action: Tensor) -> Tensor:
         """Normalise (…, D) actions, and pad them to (…, A)."""
@@ -186,14 +186,14 @@ class VisionLanguageAction(Model):
         If actions attend to later ones and there is no prefix, repeated last actions of unperturbed chunks count too.
         """
         error = (output["velocity"] - output["target"])[..., : len(self.spec.action)].square().mean(-1)
-        copies, ahead = len(error) // len(batch["valid"]), batch["perturbations"][:, -1]
-        counted = batch["valid"][:, -1]
+        copies, perturbations = len(error) // len(batch["valid"]), batch["perturbations"][:, -1]
+        mask = batch["valid"][:, -1]
         if not self.network.causal and not self.prefix:
-            counted = counted | ((ahead < 0) & (ahead.amax(1, keepdim=True) == 0))
-        counted = counted.repeat(copies, 1)
+            mask = mask | ((perturbations < 0) & (perturbations.amax(1, keepdim=True) == 0))
+        mask = mask.repeat(copies, 1)
         if self.prefix:
-            counted = after_prefix(ahead.repeat(copies, 1), batch["length"])
-        return {"action_loss": mean_where(error, counted)}
+            mask = after_prefix(perturbations.repeat(copies, 1), batch["length"])
+        return {"action_loss": mean_where(error, mask)}
 
     def predict(self, batch: Batch) -> Prediction:
         """Transport the "noise" of the batch, or else a fixed noise, to actions."""
@@ -208,8 +208,8 @@ class VisionLanguageAction(Model):
 
 def last_of(known: Prefix) -> Tensor:
     """Return the last layer's values of the last token, before any padding, of every prefix, (B, `value_width`)."""
-    last = newest(known.present)
-    return known.values[-1][torch.arange(len(last), device=last.device), :, last].flatten(1)
+    indices = newest(known.present)
+    return known.values[-1][torch.arange(len(indices), device=indices.device), :, indices].flatten(1)
 
 
 def resize_with_padding(images: Tensor, size: int, place: Place) -> Tensor:
@@ -233,45 +233,45 @@ def repeated(prefix: Prefix, copies: int) -> Prefix:
     return Prefix(keys, values, prefix.present.repeat(copies, 1))
 
 
-def _require_width(what: str, components: int, width: int) -> None:
+def _require_width(kind: str, components: int, width: int) -> None:
     if components > width:
-        raise UserError(f"the {what} has {components} components, more than model.network.{what}_width={width}")
+        raise UserError(f"the {kind} has {components} components, more than model.network.{kind}_width={width}")
 
 
-def _random(network: Callable[[], FlowNetwork]) -> FlowNetwork:
+def _random_network(network: Callable[[], FlowNetwork]) -> FlowNetwork:
     """Build a network of random weights; a UserError, before any is drawn, if they need more memory than is free."""
     sketch(network)
     return network()
 
 
-def _cameras(named: dict[str, str | None] | None, spec: Spec, trunk: Trunk | None) -> list[str]:
+def _cameras(mapping: dict[str, str | None] | None, spec: Spec, trunk: Trunk | None) -> list[str]:
     """Return the cameras of the spec in the order in which the network sees them.
 
     Raises:
         UserError: one is unknown, or one of the pretrained policy has no counterpart.
     """
-    seen, ours = trunk.cameras if trunk else [], ", ".join(spec.cameras)
-    if named is None:
-        if seen and seen != [*spec.cameras]:
+    views, names = trunk.cameras if trunk else [], ", ".join(spec.cameras)
+    if mapping is None:
+        if views and views != [*spec.cameras]:
             raise UserError(
-                f"{trunk} sees {', '.join(seen)}, and the demonstrations have {ours}: say which is which, null for "
-                f"none, as in 'model.cameras={{{seen[0]}: {spec.cameras[0]}, …}}'"
+                f"{trunk} sees {', '.join(views)}, and the demonstrations have {names}: say which is which, null for "
+                f"none, as in 'model.cameras={{{views[0]}: {spec.cameras[0]}, …}}'"
             )
         return [*spec.cameras]
-    if missing := [camera for camera in seen if camera not in named]:
+    if missing := [camera for camera in views if camera not in mapping]:
         raise UserError(f"model.cameras lacks {', '.join(missing)}, which {trunk} sees: map each to a camera or null")
-    if seen and (unknown := [camera for camera in named if camera not in seen]):
-        raise UserError(f"model.cameras names {', '.join(unknown)}, but {trunk} sees {', '.join(seen)}")
-    chosen = [camera for camera in named.values() if camera is not None]
-    if seen and seen != [*named]:
-        raise UserError(f"model.cameras names the cameras of {trunk} in another order: it sees {', '.join(seen)}")
-    if unknown := [camera for camera in chosen if camera not in spec.cameras]:
-        raise UserError(f"model.cameras names {', '.join(unknown)}, but the demonstrations have {ours}")
-    if not chosen:
-        raise UserError(f"model.cameras names none of the cameras of the demonstrations, {ours}")
-    if twice := [camera for camera in chosen if chosen.count(camera) > 1]:
+    if views and (unknown := [camera for camera in mapping if camera not in views]):
+        raise UserError(f"model.cameras names {', '.join(unknown)}, but {trunk} sees {', '.join(views)}")
+    cameras = [camera for camera in mapping.values() if camera is not None]
+    if views and views != [*mapping]:
+        raise UserError(f"model.cameras names the cameras of {trunk} in another order: it sees {', '.join(views)}")
+    if unknown := [camera for camera in cameras if camera not in spec.cameras]:
+        raise UserError(f"model.cameras names {', '.join(unknown)}, but the demonstrations have {names}")
+    if not cameras:
+        raise UserError(f"model.cameras names none of the cameras of the demonstrations, {names}")
+    if copies := [camera for camera in cameras if cameras.count(camera) > 1]:
         raise UserError(
-            f"model.cameras maps two cameras of the pretrained policy to {twice[0]}: map each to a camera of its own, "
+            f"model.cameras maps two cameras of the pretrained policy to {copies[0]}: map each to a camera of its own, "
             "or to null if there is none"
         )
-    return chosen
+    return cameras

@@ -56,14 +56,14 @@ class Prompt(TextEncoder):
         self.name, self.length, self.state = name, length, state
         self._tokenizer, self._sha256 = (None, None) if name is None else _tokenizer(name)
         if state:
-            bare = [self._ids(f" {number}", special=False) for number in range(-1, BINS)]
-            self.register_buffer("numbers", _padded(bare, max(map(len, bare))), persistent=False)
+            number_ids = [self._ids(f" {number}", special=False) for number in range(-1, BINS)]
+            self.register_buffer("numbers", _padded_tensor(number_ids, max(map(len, number_ids))), persistent=False)
             self.register_buffer("end", torch.tensor(self._ids(";\nAction: ", special=False)), persistent=False)
             pieces = [
                 self._ids("Task: pick it up, State:", special=True),
-                bare[0],
-                bare[1],
-                bare[-1],
+                number_ids[0],
+                number_ids[1],
+                number_ids[-1],
                 self.end.tolist(),
             ]
             if [token for piece in pieces for token in piece] != self._ids(TRIED, special=True):
@@ -74,11 +74,11 @@ class Prompt(TextEncoder):
     def tokenize(self, sentences: list[str]) -> Tensor:
         """Return (B, L) int64 tokens, `PADDING` after the end; L is the longest sentence rounded up to `STEP`s."""
         texts = [
-            f"Task: {_clean(each)}, State:" if self.state else each.removesuffix("\n") + "\n" for each in sentences
+            f"Task: {_clean(text)}, State:" if self.state else text.removesuffix("\n") + "\n" for text in sentences
         ]
         rows = [self._ids(text, special=True)[: self.length] for text in texts]
         longest = max(map(len, rows))
-        return _padded(rows, min(self.length, -longest % STEP + longest))
+        return _padded_tensor(rows, min(self.length, -longest % STEP + longest))
 
     def forward(self, tokens: Tensor, state: Tensor | None = None) -> Tensor:
         """Return the tokens of whole prompts, (B, ≤ L), from the output of `tokenize` and the (B, S) scaled state."""
@@ -101,16 +101,16 @@ class Prompt(TextEncoder):
 
     def set_extra_state(self, state: Any) -> None:
         """Raise a UserError if the tokenizer differs from the one in training."""
-        trained = state.get("sha256") if isinstance(state, dict) else self._sha256
-        if trained != self._sha256:
-            raise UserError(f"the {FILE} of {self.name} is another than in training: its SHA-256 is not {trained}")
+        digest = state.get("sha256") if isinstance(state, dict) else self._sha256
+        if digest != self._sha256:
+            raise UserError(f"the {FILE} of {self.name} is another than in training: its SHA-256 is not {digest}")
 
 
 def _clean(sentence: str) -> str:
     return sentence.strip().replace("_", " ").replace("\n", " ")
 
 
-def _padded(rows: list[list[int]], length: int) -> Tensor:
+def _padded_tensor(rows: list[list[int]], length: int) -> Tensor:
     return torch.tensor([row + [PADDING] * (length - len(row)) for row in rows])
 
 

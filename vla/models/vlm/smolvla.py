@@ -104,11 +104,11 @@ class SmolVLA(FlowNetwork):
     def prefix(self, images: Tensor, cameras: Tensor, tokens: Tensor, sentence: Tensor, state: Tensor | None) -> Prefix:
         """Encode images, sentence and state; every layer of the expert gets keys and values as it uses them."""
         assert state is not None
-        read = self.vlm.text_model.embed_tokens(tokens)
-        read = read * math.sqrt(read.shape[-1])
-        seen = self._see(images, read, sentence)  # (B, C, N, E)
-        present = cameras.repeat_interleave(seen.shape[2], 1)
-        hidden = torch.cat([seen.flatten(1, 2), read, self.state_proj(state).unsqueeze(1)], 1)
+        words = self.vlm.text_model.embed_tokens(tokens)
+        words = words * math.sqrt(words.shape[-1])
+        image_tokens = self._encode_images(images, words, sentence)  # (B, C, N, E)
+        present = cameras.repeat_interleave(image_tokens.shape[2], 1)
+        hidden = torch.cat([image_tokens.flatten(1, 2), words, self.state_proj(state).unsqueeze(1)], 1)
         present = torch.cat([present, sentence, sentence.new_ones(len(sentence), 1)], 1)  # (B, P)
         mask = present[:, None, None, :].repeat(1, 1, present.shape[1], 1)  # (B, 1, P, P)
         mask[:, :, :-1, -1] = False  # only the state sees the state
@@ -118,32 +118,32 @@ class SmolVLA(FlowNetwork):
             pairs.append(pair if expert.self_attn.joint else expert(None, prefix=pair))
         return Prefix(tuple(keys for keys, _ in pairs), tuple(values for _, values in pairs), present)
 
-    def _see(self, images: Tensor, read: Tensor, sentence: Tensor) -> Tensor:
+    def _encode_images(self, images: Tensor, words: Tensor, sentence: Tensor) -> Tensor:
         """Return tokens of (B, C, 3, H, W) images, (B, C, N, E); keypoints depend on the (B, L, E) words, too."""
-        every = images.flatten(0, 1)
+        flat_images = images.flatten(0, 1)
         if self.keypoints is not None:
-            words = (read * sentence.unsqueeze(-1)).sum(1)
-            seen = self.keypoints(every, words.repeat_interleave(images.shape[1], 0))
+            word_sum = (words * sentence.unsqueeze(-1)).sum(1)
+            image_tokens = self.keypoints(flat_images, word_sum.repeat_interleave(images.shape[1], 0))
         else:
             patches = self.resolution // self.vision["patch_size"]
-            whole = sentence.new_ones(len(every), patches, patches)  # by default it is made on the CPU and copied
-            encoded = self.vlm.vision_model(pixel_values=every, patch_attention_mask=whole)
-            seen = self.vlm.connector(encoded.last_hidden_state)
-            seen = seen * math.sqrt(seen.shape[-1])
-        return seen.unflatten(0, images.shape[:2])
+            mask = sentence.new_ones(len(flat_images), patches, patches)  # by default it is made on the CPU and copied
+            features = self.vlm.vision_model(pixel_values=flat_images, patch_attention_mask=mask)
+            image_tokens = self.vlm.connector(features.last_hidden_state)
+            image_tokens = image_tokens * math.sqrt(image_tokens.shape[-1])
+        return image_tokens.unflatten(0, images.shape[:2])
 
     def velocity(self, prefix: Prefix, noisy: Tensor, time: Tensor) -> Tensor:
         """Predict the velocity of (B, k, A) noisy actions at times (B,) or (B, k)."""
         hidden, count = self.action_in_proj(noisy), noisy.shape[1]
         hidden = with_time(hidden, time, (self.action_time_mlp_in, self.action_time_mlp_out), torch.float64)
         places = torch.arange(count, device=noisy.device)
-        after = rotation_of(prefix.present.sum(1, keepdim=True) + places, self.head_width)
-        first = rotation_of(places.unsqueeze(0), self.head_width)
-        known = prefix.present[:, None, None, :].expand(-1, 1, count, -1)
-        causal = (places[:, None] >= places).expand(len(noisy), 1, count, count)
-        joint = torch.cat([known, causal], -1)  # (B, 1, k, P + k)
+        joint_rotation = rotation_of(prefix.present.sum(1, keepdim=True) + places, self.head_width)
+        cross_rotation = rotation_of(places.unsqueeze(0), self.head_width)
+        prefix_mask = prefix.present[:, None, None, :].expand(-1, 1, count, -1)
+        causal_mask = (places[:, None] >= places).expand(len(noisy), 1, count, count)
+        joint_mask = torch.cat([prefix_mask, causal_mask], -1)  # (B, 1, k, P + k)
         for layer, keys, values in zip(self.expert.layers, prefix.keys, prefix.values, strict=True):
-            mask, rotation = (joint, after) if layer.self_attn.joint else (known, first)
+            mask, rotation = (joint_mask, joint_rotation) if layer.self_attn.joint else (prefix_mask, cross_rotation)
             hidden = layer(hidden, attention_mask=mask, position_embeddings=rotation, prefix=(keys, values))
         return self.action_out_proj(self.expert.norm(hidden).float())
 
@@ -198,7 +198,7 @@ class ExpertAttention(LlamaAttention):
 
     def read(self, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return keys and values of the prefix, (B, heads, P, H) each, as `forward` takes them if it is not joint."""
-        return self._by_head(self.k_proj(_flat(keys))), self._by_head(self.v_proj(_flat(values)))
+        return self._split_heads(self.k_proj(_join_heads(keys))), self._split_heads(self.v_proj(_join_heads(values)))
 
     def forward(
         self,
@@ -209,16 +209,16 @@ class ExpertAttention(LlamaAttention):
         **_: Any,
     ) -> tuple[Tensor, None]:
         """Attend from (B, k, F) with a (B, 1, k, P) mask, or (B, 1, k, P + k) if it is joint."""
-        query, (keys, values) = self._by_head(self.q_proj(hidden_states)), prefix
-        own = self._by_head(self.k_proj(hidden_states)) if self.joint else query
-        query, own = apply_rotary_pos_emb(query, own, *position_embeddings)
+        query, (keys, values) = self._split_heads(self.q_proj(hidden_states)), prefix
+        own_keys = self._split_heads(self.k_proj(hidden_states)) if self.joint else query
+        query, own_keys = apply_rotary_pos_emb(query, own_keys, *position_embeddings)
         if self.joint:
-            keys = torch.cat([keys, own], 2)
-            values = torch.cat([values, self._by_head(self.v_proj(hidden_states))], 2)
-        attended = F.scaled_dot_product_attention(query, keys, values, attention_mask, enable_gqa=True)
-        return self.o_proj(_flat(attended)), None
+            keys = torch.cat([keys, own_keys], 2)
+            values = torch.cat([values, self._split_heads(self.v_proj(hidden_states))], 2)
+        output = F.scaled_dot_product_attention(query, keys, values, attention_mask, enable_gqa=True)
+        return self.o_proj(_join_heads(output)), None
 
-    def _by_head(self, features: Tensor) -> Tensor:
+    def _split_heads(self, features: Tensor) -> Tensor:
         return features.unflatten(-1, (-1, self.head_dim)).transpose(1, 2)
 
 
@@ -250,6 +250,6 @@ def rotation_of(positions: Tensor, width: int) -> Rotation:
     return angles.cos(), angles.sin()
 
 
-def _flat(by_head: Tensor) -> Tensor:
+def _join_heads(by_head: Tensor) -> Tensor:
     """Join the heads of (B, heads, N, H)."""
     return by_head.transpose(1, 2).flatten(2)

@@ -52,10 +52,10 @@ class Trunk:
         kind = self._config.get("type")
         if self.is_policy and kind not in KINDS:
             raise UserError(f"{name} is a policy of LeRobot's type {kind}, and only {', '.join(KINDS)} are supported")
-        for option, known in OPTIONS.items():
-            if self._config.get(option, known[0]) not in known:
+        for option, values in OPTIONS.items():
+            if self._config.get(option, values[0]) not in values:
                 raise UserError(
-                    f"{name} was trained with {option}={self._config[option]}, and only {known[0]} is supported"
+                    f"{name} was trained with {option}={self._config[option]}, and only {values[0]} is supported"
                 )
         self._files = sorted(self.folder.glob(WEIGHTS))
         if not self._files:
@@ -77,8 +77,8 @@ class Trunk:
     @property
     def cameras(self) -> list[str]:
         """The cameras that the policy sees, in their order; empty for a vision-language model alone."""
-        features = self._of("input_features", dict[str, dict[str, Any]])
-        return [name.removeprefix(IMAGES) for name, each in features.items() if each.get("type") == "VISUAL"]
+        features = self._mapping("input_features", dict[str, dict[str, Any]])
+        return [name.removeprefix(IMAGES) for name, feature in features.items() if feature.get("type") == "VISUAL"]
 
     def statistics(self, kind: Kind) -> dict[str, Tensor]:
         """Return the statistics by which the policy normalises, such as action.mean; empty if it has no normaliser.
@@ -86,21 +86,21 @@ class Trunk:
         Raises:
             UserError: it normalises in another way than `kind`.
         """
-        mapping = self._of("normalization_mapping", dict[str, str])
-        modes = {mapping[each] for each in ("STATE", "ACTION") if each in mapping}
-        if wrong := modes - {MODES[kind]}:
+        mapping = self._mapping("normalization_mapping", dict[str, str])
+        modes = {mapping[feature] for feature in ("STATE", "ACTION") if feature in mapping}
+        if rest := modes - {MODES[kind]}:
             raise UserError(
-                f"{self} normalises by {', '.join(sorted(wrong))}, and model.normalization is {kind}: choose the same, "
+                f"{self} normalises by {', '.join(sorted(rest))}, and model.normalization is {kind}: choose the same, "
                 "or model.statistics=demonstrations"
             )
         path = self.folder / PREPROCESSOR
-        read = read_json(path, dict[str, Any]).get("steps", []) if path.is_file() else []
-        steps = parse_plain(read, list[dict[str, Any]], f"steps of {path}")
+        raw_steps = read_json(path, dict[str, Any]).get("steps", []) if path.is_file() else []
+        steps = parse_plain(raw_steps, list[dict[str, Any]], f"steps of {path}")
         files = [step.get("state_file") for step in steps if step.get("registry_name") == NORMALIZER]
         paths = [self.folder / Path(str(name)).name for name in files if name]
         return {name: tensor for path in paths if path.is_file() for name, tensor in _tensors([path])}
 
-    def _of(self, key: str, kind: type[Part]) -> Part:
+    def _mapping(self, key: str, kind: type[Part]) -> Part:
         """Return a mapping in the config; an empty one if it is missing."""
         return parse_plain(self._config.get(key) or {}, kind, f"{key} of {self.folder / CONFIG}")
 
@@ -112,61 +112,61 @@ class Trunk:
         Raises:
             UserError: a weight is missing, unknown or of another shape, or they need more memory than is free.
         """
-        built = sketch(network)
-        if any(isinstance(module, ImageEncoder) for module in built.modules()):
-            built = network()  # such an encoder is small, and may have weights of its own, which a sketch lacks
-        own = dict(built.named_parameters())
-        found = dict[str, Tensor]()
-        for theirs, tensor in _tensors(self._files):
-            name = renamed(theirs, built.published if self.is_policy else built.pretrained)
-            if name in own:
-                if tensor.shape != own[name].shape:
-                    shapes = f"{[*tensor.shape]}, and the model has {[*own[name].shape]}"
-                    raise UserError(f"{theirs} in {self} has shape {shapes}: choose another model= or model.network")
-                found[name] = tensor.to(torch.float32, copy=True)
-            elif self.is_policy and not theirs.startswith(built.unused):
-                raise UserError(f"{self} has {theirs}, which the model lacks: choose another model= or model.network")
-        parts = ("",) if self.is_policy else tuple(ours for _, ours in built.pretrained)
-        if missing := [name for name in own if name not in found and name.startswith(parts)]:
-            more = ", …" if len(missing) > 1 else ""
-            raise UserError(f"{self} lacks weights of the model: {missing[0]}{more}")
-        built.load_state_dict(found, strict=False, assign=True)
-        materialize(built)
+        instance = sketch(network)
+        if any(isinstance(module, ImageEncoder) for module in instance.modules()):
+            instance = network()  # such an encoder is small, and may have weights of its own, which a sketch lacks
+        parameters = dict(instance.named_parameters())
+        weights = dict[str, Tensor]()
+        for key, tensor in _tensors(self._files):
+            name = renamed(key, instance.published if self.is_policy else instance.pretrained)
+            if name in parameters:
+                if tensor.shape != parameters[name].shape:
+                    shapes = f"{[*tensor.shape]}, and the model has {[*parameters[name].shape]}"
+                    raise UserError(f"{key} in {self} has shape {shapes}: choose another model= or model.network")
+                weights[name] = tensor.to(torch.float32, copy=True)
+            elif self.is_policy and not key.startswith(instance.unused):
+                raise UserError(f"{self} has {key}, which the model lacks: choose another model= or model.network")
+        prefixes = ("",) if self.is_policy else tuple(prefix for _, prefix in instance.pretrained)
+        if missing_names := [name for name in parameters if name not in weights and name.startswith(prefixes)]:
+            suffix = ", …" if len(missing_names) > 1 else ""
+            raise UserError(f"{self} lacks weights of the model: {missing_names[0]}{suffix}")
+        instance.load_state_dict(weights, strict=False, assign=True)
+        materialize(instance)
         source: Any = self.source
-        for part, module in built.named_modules():
+        for part, module in instance.named_modules():
             names = [f"{part}.{name}".removeprefix(".") for name, _ in module.named_parameters()]
-            if names and found.keys() >= {*names}:
+            if names and weights.keys() >= {*names}:
                 module.source = source
-        return built
+        return instance
 
 
 def sketch(network: Callable[[], FlowNetwork]) -> FlowNetwork:
     """Build a network without values, on the device "meta"; a UserError if its weights exceed the free memory."""
     # Warnings of an image encoder's own weights, of which a sketch takes the shapes only.
     with torch.device("meta"), warnings.catch_warnings(action="ignore"):
-        built = network()
-    needed, free = sum(weight.nbytes for weight in built.parameters()), free_memory()
-    if needed > free:
+        instance = network()
+    size, room = sum(weight.nbytes for weight in instance.parameters()), free_memory()
+    if size > room:
         raise UserError(
-            f"the weights of {type(built).__name__} need {needed / 1e9:.1f} GB of memory, and {free / 1e9:.1f} GB are "
+            f"the weights of {type(instance).__name__} need {size / 1e9:.1f} GB of memory, and {room / 1e9:.1f} GB are "
             "free: use a machine with more, or lower sizes in model.network"
         )
-    return built
+    return instance
 
 
 def materialize(network: nn.Module) -> None:
     """Allocate all tensors that are on the device "meta", with the values of an untrained network."""
     for weight in network.parameters():
-        marked: Any = weight
-        marked._is_hf_initialized = not weight.is_meta  # transformers does not initialise marked weights
+        hf_weight: Any = weight
+        hf_weight._is_hf_initialized = not weight.is_meta  # transformers does not initialise marked weights
     for name, module in network.named_modules():
-        own = [*module.named_parameters(recurse=False), *module.named_buffers(recurse=False)]
-        if not any(tensor.is_meta for _, tensor in own):
+        tensors = [*module.named_parameters(recurse=False), *module.named_buffers(recurse=False)]
+        if not any(tensor.is_meta for _, tensor in tensors):
             continue
-        loaded = {key: tensor.data for key, tensor in own if not tensor.is_meta}
+        values = {key: tensor.data for key, tensor in tensors if not tensor.is_meta}
         module.to_empty(device="cpu", recurse=False)
         _initialize(network, name, module)
-        for key, tensor in loaded.items():
+        for key, tensor in values.items():
             getattr(module, key).data = tensor
 
 
