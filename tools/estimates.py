@@ -38,16 +38,16 @@ def main(overrides: list[str]) -> None:
     print(
         "| training | memory [GB]: said | taken | at its start | a step [ms]: said | taken |\n|---|---|---|---|---|---|"
     )
-    for name, chosen in TRAININGS.items():
+    for name, options in TRAININGS.items():
         with TemporaryDirectory() as folder:
             output = (f"output={folder}/run", f"hydra.run.dir={folder}/run")
-            command = [sys.executable, "-c", PROGRAM, *SHORT, *chosen, *output, *overrides]
-            done = subprocess.run(command, capture_output=True, text=True, cwd=Path.cwd())
-        text = " ".join(done.stdout.split())
-        said, took = re.search(SAID, text), re.search(TOOK, text)
-        if said is None or took is None:
-            sys.exit(done.stdout + done.stderr)
-        print(f"| {name} | {said[1]} | {took[1]} | {said[2]} | {took[3]} | {took[2]} |", flush=True)
+            command = [sys.executable, "-c", PROGRAM, *SHORT, *options, *output, *overrides]
+            process = subprocess.run(command, capture_output=True, text=True, cwd=Path.cwd())
+        text = " ".join(process.stdout.split())
+        estimate, measure = re.search(SAID, text), re.search(TOOK, text)
+        if estimate is None or measure is None:
+            sys.exit(process.stdout + process.stderr)
+        print(f"| {name} | {estimate[1]} | {measure[1]} | {estimate[2]} | {measure[3]} | {measure[2]} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -58,8 +58,8 @@ def load_environment(
     Raises:
         UserError: as in `load_policy`, the policy's task names a path, or it consists of recordings only.
     """
-    saved = read_policy(checkpoint)
-    task = {"task": saved.config["task"]}
+    saved_policy = read_policy(checkpoint)
+    task = {"task": saved_policy.config["task"]}
     with trusting(trust):
         require_no_paths(task, ["task"], checkpoint)
         return GymEnvironment(make_environment(with_changes(task["task"], changes or {})), render_mode)

@@ -125,8 +125,8 @@ class Spec:
 
     def given(self, names: Container[str]) -> list[str]:
         """Return the images to provide: all cameras, or, if `names` contains it, `PICTURE` in place of the cut ones."""
-        whole = self.parts and PICTURE in names
-        return [PICTURE, *(name for name in self.cameras if name not in self.cut)] if whole else [*self.cameras]
+        uses_picture = self.parts and PICTURE in names
+        return [PICTURE, *(name for name in self.cameras if name not in self.cut)] if uses_picture else [*self.cameras]
 
     def size(self, image: str) -> tuple[int, int]:
         """Return the height and width [px] at which an image is as detailed as the images in training."""
@@ -151,8 +151,8 @@ class Spec:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings, for JSON and for checkpoints loaded with `weights_only=True`."""
-        plain: dict[str, Any] = json.loads(json.dumps(asdict(self), default=lambda number: number.item()))
-        return plain
+        values: dict[str, Any] = json.loads(json.dumps(asdict(self), default=lambda number: number.item()))
+        return values
 
     @classmethod
     def from_dict(cls, values: Any, name: str = "the spec") -> Spec:
@@ -167,18 +167,18 @@ class Spec:
 
         A chain, home posture or parts that only one of them knows are not a difference.
         """
-        mine, theirs = _fields(self), _fields(other)
-        for name, value in mine.items():
-            unknown = name in ("robot.chain", "robot.home", "parts") and () in (value, theirs.get(name))
-            if value != theirs.get(name) and not unknown:
+        fields, other_fields = _fields(self), _fields(other)
+        for name, value in fields.items():
+            unknown = name in ("robot.chain", "robot.home", "parts") and () in (value, other_fields.get(name))
+            if value != other_fields.get(name) and not unknown:
                 raise UserError(
-                    f"{what} has {name} = {str(value)[:200]}, but {against} has {str(theirs.get(name))[:200]}"
+                    f"{what} has {name} = {str(value)[:200]}, but {against} has {str(other_fields.get(name))[:200]}"
                 )
 
     def require_input(self, other: Spec, what: str, against: str) -> None:
         """Like `require`, for the inputs and outputs of a policy: truth and the size of uncut images are ignored."""
-        mine, theirs = self.without_truth, other.without_truth
-        (mine if self.parts else replace(mine, image_size=theirs.image_size)).require(theirs, what, against)
+        spec, reference = self.without_truth, other.without_truth
+        (spec if self.parts else replace(spec, image_size=reference.image_size)).require(reference, what, against)
 
 
 def _fields(spec: Spec) -> dict[str, Any]:
@@ -189,14 +189,14 @@ def _fields(spec: Spec) -> dict[str, Any]:
 
 def _contradictions(spec: Spec) -> Iterator[str]:
     """Yield the inconsistencies between fields that are valid on their own."""
-    for name, other in (("state_units", "state"), ("units", "action"), ("low", "action"), ("high", "action")):
-        if len(getattr(spec, name)) != len(getattr(spec, other)):
-            yield f"{name} has {len(getattr(spec, name))} components, {other} {len(getattr(spec, other))}"
+    for name, counterpart in (("state_units", "state"), ("units", "action"), ("low", "action"), ("high", "action")):
+        if len(getattr(spec, name)) != len(getattr(spec, counterpart)):
+            yield f"{name} has {len(getattr(spec, name))} components, {counterpart} {len(getattr(spec, counterpart))}"
     for name, low, high in zip(spec.action, spec.low, spec.high, strict=False):
         if not low < high:
             yield f"low of {name} is {low}, not less than high, {high}"
-    if unknown := [camera for camera in spec.depth if camera not in spec.cameras]:
-        yield f"depth names {', '.join(unknown)}, which is not among the cameras"
+    if unknown_names := [camera for camera in spec.depth if camera not in spec.cameras]:
+        yield f"depth names {', '.join(unknown_names)}, which is not among the cameras"
     if not unique(spec.cut):
         yield "parts names a camera twice"
     for part in spec.parts:
@@ -205,8 +205,8 @@ def _contradictions(spec: Spec) -> Iterator[str]:
         yield "truth has a name twice, or more than 4096 numbers"
     if robot := spec.robot:
         joints = len(robot.joints)
-        if unknown := [name for name in robot.components if name not in spec.state]:
-            yield f"robot names {', '.join(unknown)}, which is not in the state"
+        if unknown_names := [name for name in robot.components if name not in spec.state]:
+            yield f"robot names {', '.join(unknown_names)}, which is not in the state"
         for name in ("velocities", "home"):
             if len(getattr(robot, name)) not in (0, joints):
                 yield f"robot has {joints} joints, but {len(getattr(robot, name))} entries in {name}"
@@ -239,8 +239,8 @@ class Observation:
     def from_mapping(cls, values: Mapping[str, Any], spec: Spec) -> Observation:
         """Convert a gymnasium observation: images by camera, "state", "instruction"; a UserError if one is missing."""
         cameras = spec.given(values)
-        if missing := [name for name in (*cameras, "state", "instruction") if name not in values]:
-            raise UserError(f"the observation has {', '.join(map(str, values))}, but lacks {', '.join(missing)}")
+        if missing_keys := [name for name in (*cameras, "state", "instruction") if name not in values]:
+            raise UserError(f"the observation has {', '.join(map(str, values))}, but lacks {', '.join(missing_keys)}")
         rgb = {camera: values[camera] for camera in cameras}
         return cls(rgb, values["state"], values["instruction"])
 

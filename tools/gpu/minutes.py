@@ -118,12 +118,12 @@ class Minutes:
         """Unpack the packages and, where there are none, the loaders of OpenGL, which only work in their place."""
         for name in ("site", "mesa"):
             archive = kit / f"{name}.tar.xz"
-            there = self.work / name
-            if archive.exists() and not (there.exists() and there.stat().st_mtime >= archive.stat().st_mtime):
-                shutil.rmtree(there, ignore_errors=True)  # of an older kit
+            folder = self.work / name
+            if archive.exists() and not (folder.exists() and folder.stat().st_mtime >= archive.stat().st_mtime):
+                shutil.rmtree(folder, ignore_errors=True)  # of an older kit
                 with tarfile.open(archive) as files:
                     files.extractall(self.work, filter="data")
-                os.utime(there)
+                os.utime(folder)
         libraries = subprocess.run(["ldconfig", "-p"], capture_output=True, text=True).stdout
         if "libEGL.so.1" not in libraries and self.sizes.device == "gpu":
             for package in sorted(kit.glob("gl/*.deb")):
@@ -138,20 +138,20 @@ class Minutes:
         `more` are further environment variables.
         """
         limit = min(limit * self.sizes.slower, self.left - 5)
-        noted: dict[str, Any] = {"command": " ".join(command[-12:]), "limit_s": round(limit), "status": None}
+        notes: dict[str, Any] = {"command": " ".join(command[-12:]), "limit_s": round(limit), "status": None}
         if limit >= LEAST:
-            began, log = time.monotonic(), self.work / f"{name}.log"
+            start, log = time.monotonic(), self.work / f"{name}.log"
             cwd, env = self.work, {**self.environment, **more}
             with log.open("wb") as file:
                 process = subprocess.Popen(command, cwd=cwd, env=env, stdout=file, stderr=file, start_new_session=True)
-                noted["status"] = _ended(process, limit)
+                notes["status"] = _exit_status(process, limit)
             text = log.read_text(errors="replace").replace("\r", "\n")
-            noted |= {
-                "seconds": round(time.monotonic() - began, 1),
+            notes |= {
+                "seconds": round(time.monotonic() - start, 1),
                 "log": [line[:400] for line in text.split("\n")[-40:]],
             }
-        print(f"{step} {name}: status {noted['status']}, {noted.get('seconds')} s; {self.left:.0f} s left", flush=True)
-        return self.note(step, name, noted)
+        print(f"{step} {name}: status {notes['status']}, {notes.get('seconds')} s; {self.left:.0f} s left", flush=True)
+        return self.note(step, name, notes)
 
     def note(self, step: str, name: str, values: dict[str, Any]) -> dict[str, Any]:
         """Write values into the file of a step, and return them."""
@@ -162,8 +162,8 @@ class Minutes:
         """Run a job of vla, and note its figures, too."""
         output = self.work / "runs" / name
         command = [sys.executable, "-m", "vla.run", "recorder=none", f"cluster.workers={self.sizes.workers}"]
-        noted = self.run(step, name, limit, *command, *overrides, f"output={output}", **more)
-        return self.note(step, name, noted | figures_of(output))
+        notes = self.run(step, name, limit, *command, *overrides, f"output={output}", **more)
+        return self.note(step, name, notes | figures_of(output))
 
     def data(self, episodes: int) -> list[str]:
         """Return the overrides that use that many of the collected demonstrations."""
@@ -180,8 +180,8 @@ class Minutes:
         if not (self.work / "mesa").exists():
             return
         if collected["status"] == 0:
-            elsewhere = [f"collect.folder={self.work / 'compared'}", f"collect.episodes={sizes.compared}"]
-            self.vla("b", "collect_by_mesa", 60, "job=collect", *elsewhere, **self._mesa())
+            overrides = [f"collect.folder={self.work / 'compared'}", f"collect.episodes={sizes.compared}"]
+            self.vla("b", "collect_by_mesa", 60, "job=collect", *overrides, **self._mesa())
         else:  # the other steps need demonstrations, and draw in the same way
             self._draw_by_mesa()
             self.vla("b", "collect_by_mesa", 170, "job=collect", *self.data(sizes.demonstrations))
@@ -192,9 +192,9 @@ class Minutes:
         self._demonstrations = self.work / BY_MESA
 
     def _mesa(self) -> dict[str, str]:
-        folder, before = self.work / "mesa", os.environ.get("LD_LIBRARY_PATH")  # which may lead to the GPU's driver
+        folder, path = self.work / "mesa", os.environ.get("LD_LIBRARY_PATH")  # which may lead to the GPU's driver
         return {
-            "LD_LIBRARY_PATH": os.pathsep.join(filter(None, (str(folder / "lib"), before))),
+            "LD_LIBRARY_PATH": os.pathsep.join(filter(None, (str(folder / "lib"), path))),
             "LIBGL_DRIVERS_PATH": str(folder / "dri"),
             "__EGL_VENDOR_LIBRARY_FILENAMES": str(folder / "vendor.json"),
             "EGL_PLATFORM": "surfaceless",
@@ -211,9 +211,9 @@ class Minutes:
         """Time a training of the large model."""
         sizes = self.sizes
         timing = [f"benchmark.steps={sizes.timed}", "benchmark.rounds=1", f"benchmark.compile=[{compiled}]"]
-        what = [f"model={sizes.model}", f"trainer.accelerator={sizes.device}", f"data.batch_size={batch}"]
-        asked = ["job=benchmark", "benchmark.names=[train]", f"benchmark.precisions=[{precision}]"]
-        self.vla(step, name, limit, *asked, *timing, *what, *self.data(sizes.used))
+        training = [f"model={sizes.model}", f"trainer.accelerator={sizes.device}", f"data.batch_size={batch}"]
+        job = ["job=benchmark", "benchmark.names=[train]", f"benchmark.precisions=[{precision}]"]
+        self.vla(step, name, limit, *job, *timing, *training, *self.data(sizes.used))
 
     def d(self) -> None:
         """Train the large model for as long as there is time, in the way that c found faster, and evaluate it.
@@ -231,8 +231,8 @@ class Minutes:
 
     def g(self) -> None:
         """Train bc, and evaluate it."""
-        what = ["model=bc", *self.data(self.sizes.used)]
-        self.train("g", "bc", 90, self.sizes.trained, self.sizes.compiled, *what)
+        overrides = ["model=bc", *self.data(self.sizes.used)]
+        self.train("g", "bc", 90, self.sizes.trained, self.sizes.compiled, *overrides)
 
     def train(self, step: str, name: str, limit: float, steps: int, compiled: bool, *overrides: str) -> None:
         """Train a policy without validations, eager if it cannot be compiled, then evaluate it."""
@@ -244,48 +244,48 @@ class Minutes:
         ]
         settings += [f"trainer.val_check_interval={NEVER}", f"trainer.log_every_n_steps={min(20, steps)}"]
         settings += ["job=train", "validate.episodes=0", *overrides]
-        for each in (name, f"{name}_eager", f"{name}_evaluated", f"{name}_eager_evaluated"):
-            shutil.rmtree(self.work / "runs" / each, ignore_errors=True)  # of an earlier call
-        ended = self.vla(step, name, limit, f"learner.compile={compiled}", *settings)
-        if compiled and ended["status"] not in (0, None):
+        for run in (name, f"{name}_eager", f"{name}_evaluated", f"{name}_eager_evaluated"):
+            shutil.rmtree(self.work / "runs" / run, ignore_errors=True)  # of an earlier call
+        notes = self.vla(step, name, limit, f"learner.compile={compiled}", *settings)
+        if compiled and notes["status"] not in (0, None):
             name = f"{name}_eager"
-            ended = self.vla(step, name, limit, "learner.compile=False", *settings)
-        if ended["status"] == 0:
-            asked = [f"checkpoint={self.work / 'runs' / name}", f"evaluate.episodes={sizes.evaluated}"]
-            asked += ["cluster.policy=here", f"policy.lanes={min(sizes.workers, 16)}"] if sizes.device == "gpu" else []
-            self.vla(step, f"{name}_evaluated", 150, *asked)
+            notes = self.vla(step, name, limit, "learner.compile=False", *settings)
+        if notes["status"] == 0:
+            trials = [f"checkpoint={self.work / 'runs' / name}", f"evaluate.episodes={sizes.evaluated}"]
+            trials += ["cluster.policy=here", f"policy.lanes={min(sizes.workers, 16)}"] if sizes.device == "gpu" else []
+            self.vla(step, f"{name}_evaluated", 150, *trials)
 
     def e(self) -> None:
         """Time single decisions of policies."""
         sizes = self.sizes
-        asked = [str(self._demonstrations), str(sizes.used), str(sizes.plans), str(sizes.compiled)]
+        inputs = [str(self._demonstrations), str(sizes.used), str(sizes.plans), str(sizes.compiled)]
         models = ["bc", sizes.model, "act", "flow"]
-        self.run("e", "command", 110, sys.executable, str(PROBE), "latency", str(self.out / "e.json"), *asked, *models)
+        self.run("e", "command", 110, sys.executable, str(PROBE), "latency", str(self.out / "e.json"), *inputs, *models)
 
     def f(self) -> None:
         """Train a few steps with the strategies for several devices, on one."""
         sizes = self.sizes
         for strategy in ("ddp", "fsdp"):
-            where = [f"trainer={strategy}", "trainer.devices=1", f"trainer.accelerator={sizes.device}"]
+            trainer = [f"trainer={strategy}", "trainer.devices=1", f"trainer.accelerator={sizes.device}"]
             length = [f"trainer.max_steps={sizes.timed + 8}", f"trainer.val_check_interval={NEVER}"]
-            what = ["model=rt1_tiny", "validate.episodes=0", f"trainer.precision={sizes.precision}"]
-            self.vla("f", strategy, 60, "job=train", *where, *length, *what, *self.data(sizes.used))
+            model = ["model=rt1_tiny", "validate.episodes=0", f"trainer.precision={sizes.precision}"]
+            self.vla("f", strategy, 60, "job=train", *trainer, *length, *model, *self.data(sizes.used))
 
     def v(self) -> None:
         """Take ten steps of LoRA with vision-language-action models of random weights, and time their plans."""
         sizes = self.sizes
         for name, frozen in sizes.vlas.items():
-            what = [f"model={name}", "model.text.name=null", "learner=smolvla", "learner/lora=low_rank"]
+            model = [f"model={name}", "model.text.name=null", "learner=smolvla", "learner/lora=low_rank"]
             length = ["trainer.max_steps=10", f"trainer.val_check_interval={NEVER}", "validate.episodes=0"]
-            how = [
+            method = [
                 f"trainer.accelerator={sizes.device}",
                 f"trainer.precision={sizes.precision}",
                 f"learner.frozen=[{frozen}]",
             ]
-            self.vla("v", name, 120, "job=train", "data.batch_size=8", *what, *length, *how, *self.data(sizes.used))
+            self.vla("v", name, 120, "job=train", "data.batch_size=8", *model, *length, *method, *self.data(sizes.used))
         models = [f"{name},model.text.name=null" for name in sizes.vlas]
-        asked = [str(self._demonstrations), str(sizes.used), str(sizes.plans), str(sizes.compiled)]
-        self.run("v", "plans", 110, sys.executable, str(PROBE), "latency", str(self.out / "v.json"), *asked, *models)
+        inputs = [str(self._demonstrations), str(sizes.used), str(sizes.plans), str(sizes.compiled)]
+        self.run("v", "plans", 110, sys.executable, str(PROBE), "latency", str(self.out / "v.json"), *inputs, *models)
 
     def h(self) -> None:
         """Time rendering, other sizes of a batch, and TensorFloat-32."""
@@ -296,7 +296,7 @@ class Minutes:
         self.rate("h", "tf32", 60, max(sizes.batch // 2, 2), "fp32", False)  # which takes twice the memory
 
 
-def _ended(process: subprocess.Popen[bytes], limit: float) -> int | str:
+def _exit_status(process: subprocess.Popen[bytes], limit: float) -> int | str:
     """Wait for a process, interrupt it after `limit` seconds, and end all that it started; returns its status."""
     try:
         return process.wait(limit)
@@ -330,13 +330,13 @@ def main() -> None:
     )
     parser.add_argument("--rt1", nargs="*", default=["model.auxiliary=1.0"], metavar="KEY=VALUE", help="for step d")
     parser.add_argument("--dry", action="store_true", help="tiny sizes on a CPU")
-    asked = parser.parse_args()
-    if unknown := [step for step in asked.steps if step not in STEPS]:
-        parser.error(f"there is no step {unknown[0]}; there are {' '.join(STEPS)}")
-    sizes = DRY if asked.dry else real()
-    count = sizes.trained if asked.dry else asked.number
-    minutes = Minutes(asked.out, asked.work, asked.kit, sizes, asked.total, asked.learn, count, asked.rt1)
-    for step in asked.steps:
+    options = parser.parse_args()
+    if unknown_steps := [step for step in options.steps if step not in STEPS]:
+        parser.error(f"there is no step {unknown_steps[0]}; there are {' '.join(STEPS)}")
+    sizes = DRY if options.dry else real()
+    count = sizes.trained if options.dry else options.number
+    minutes = Minutes(options.out, options.work, options.kit, sizes, options.total, options.learn, count, options.rt1)
+    for step in options.steps:
         STEPS[step](minutes)
 
 

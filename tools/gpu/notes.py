@@ -18,27 +18,27 @@ def update(file: Path, **values: Any) -> None:
 
 def figures_of(output: Path) -> dict[str, Any]:
     """Return what a run wrote: measures of a benchmark, a training, its curves, and the outcomes of an evaluation."""
-    found: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
     for name in ("benchmark", "training"):
         if (file := output / f"{name}.json").exists():
-            found[name] = json.loads(file.read_text())
+            figures[name] = json.loads(file.read_text())
     if (file := output / "metrics.csv").exists():
         with file.open() as lines:
             rows = csv.DictReader(lines)
-            found["metrics"] = [{key: float(value) for key, value in row.items() if value} for row in rows]
+            figures["metrics"] = [{key: float(value) for key, value in row.items() if value} for row in rows]
     if (file := output / "report.json").exists():
         report = json.loads(file.read_text())
         outcomes = [episode["outcome"] for episode in report["per_episode"]]
-        found["outcomes"] = {each: outcomes.count(each) for each in sorted({*outcomes})}
-        found["latency_ms"] = report.get("latency_ms")
-    return found
+        figures["outcomes"] = {outcome: outcomes.count(outcome) for outcome in sorted({*outcomes})}
+        figures["latency_ms"] = report.get("latency_ms")
+    return figures
 
 
 def rates_of(file: Path) -> dict[str, float]:
     """Return kind, "eager" or "compiled" → rate of training in the file of step c [windows/s]."""
     rates = {}
-    for kind, noted in json.loads(file.read_text()).items() if file.exists() else ():
-        for name, measure in noted.get("benchmark", {}).get("measures", {}).items():
+    for kind, record in json.loads(file.read_text()).items() if file.exists() else ():
+        for name, measure in record.get("benchmark", {}).get("measures", {}).items():
             if name.startswith("train: ") and name.count(":") == 1 and "loader" not in name:
                 rates[kind] = float(measure["value"])
     return rates
@@ -46,6 +46,6 @@ def rates_of(file: Path) -> dict[str, float]:
 
 def compiling_of(file: Path, kind: str) -> float:
     """Return how much longer than the eager training another kind took in the file of step c [s]: it compiles."""
-    noted = json.loads(file.read_text()) if file.exists() else {}
-    taken, eager = (float(noted.get(each, {}).get("seconds", 0)) for each in (kind, "eager"))
-    return max(0.0, taken - eager)
+    records = json.loads(file.read_text()) if file.exists() else {}
+    seconds, eager_seconds = (float(records.get(name, {}).get("seconds", 0)) for name in (kind, "eager"))
+    return max(0.0, seconds - eager_seconds)

@@ -63,14 +63,14 @@ def pack_site(target: Path, work: Path) -> None:
     """Write site.tar.xz: the packages, in the versions of constraints.txt."""
     pins = pinned(PACKAGES)
     source = [pin for pin in pins if pin.startswith("antlr4")]  # has no wheel
-    others = [pin for pin in pins if pin not in source]
+    binary = [pin for pin in pins if pin not in source]
     pip, wheels = [sys.executable, "-m", "pip"], work / "wheels"
     tags = [f"manylinux_2_{minor}_x86_64" for minor in GLIBC]
     tags += [f"manylinux{name}_x86_64" for name in ("2014", "2010", "1")]
     platforms = [part for tag in tags for part in ("--platform", tag)]
     abis = [part for abi in ("cp312", "abi3", "none") for part in ("--abi", abi)]
     python = ["--python-version", "3.12", "--implementation", "cp", "--only-binary=:all:", *abis]
-    run(*pip, "download", "-q", "--no-deps", *python, *platforms, "-d", wheels, *others)
+    run(*pip, "download", "-q", "--no-deps", *python, *platforms, "-d", wheels, *binary)
     run(*pip, "wheel", "-q", "--no-deps", "-w", wheels, *source)
     for wheel in sorted(wheels.glob("*.whl")):
         unpack(wheel, work / "site")
@@ -93,11 +93,11 @@ def normalised(name: str) -> str:
 
 def unpack(wheel: Path, site: Path) -> None:
     """Unpack the files of a wheel that are used."""
-    kept = re.compile(KEPT.get(re.split(r"-\d", wheel.name)[0].lower(), ""))
+    pattern = re.compile(KEPT.get(re.split(r"-\d", wheel.name)[0].lower(), ""))
     with zipfile.ZipFile(wheel) as archive:
         for info in archive.infolist():
             name = re.sub(r"^[^/]+\.data/(purelib|platlib)/", "", info.filename)
-            unused = DROPPED.match(name) or (".dist-info/" not in name and not kept.match(name))
+            unused = DROPPED.match(name) or (".dist-info/" not in name and not pattern.match(name))
             if not info.is_dir() and ".data/" not in name and not unused:
                 (site / name).parent.mkdir(parents=True, exist_ok=True)
                 (site / name).write_bytes(archive.read(info))
@@ -122,8 +122,8 @@ def pack_mesa(target: Path, work: Path) -> None:
     shutil.copy(driver, mesa / "dri")
     for name in ENTRIES:
         shutil.copy(LIBRARIES / name, mesa / "lib")
-    linked = {line for path in (driver, *(LIBRARIES / name for name in ENTRIES)) for line in links(path)}
-    for path in linked:
+    libraries = {line for path in (driver, *(LIBRARIES / name for name in ENTRIES)) for line in links(path)}
+    for path in libraries:
         if not EVERYWHERE.match(path.name) and not path.name.startswith("libicu"):
             shutil.copy(path, mesa / "lib")
     llvm = next((mesa / "lib").glob("libLLVM*"))
@@ -139,21 +139,21 @@ def pack_mesa(target: Path, work: Path) -> None:
 def links(library: Path) -> Iterator[Path]:
     """Yield the libraries that a library links to."""
     for line in run("ldd", library).splitlines():
-        if found := re.search(r"=> (/\S+)", line):
-            yield Path(found[1])
+        if match := re.search(r"=> (/\S+)", line):
+            yield Path(match[1])
 
 
 def write_stub(user: Path, mark: str, target: Path, work: Path) -> None:
     """Replace a library by an empty one with the symbols, and their versions, that `user` has of it."""
-    undefined = [line.split()[-1] for line in run("nm", "-D", "--undefined-only", user).splitlines()]
-    symbols = sorted({tuple(each.replace("@@", "@").partition("@")[::2]) for each in undefined if mark in each})
+    imports = [line.split()[-1] for line in run("nm", "-D", "--undefined-only", user).splitlines()]
+    symbols = sorted({tuple(symbol.replace("@@", "@").partition("@")[::2]) for symbol in imports if mark in symbol})
     source, script = work / "stub.c", work / "stub.map"
     source.write_text("".join(f"void *{name};\n" for name, _ in symbols))
     versions = {version: [name for name, other in symbols if other == version] for _, version in symbols if version}
     script.write_text("".join(f"{version} {{ {'; '.join(names)}; }};\n" for version, names in versions.items()))
-    chosen = [f"-Wl,--version-script={script}"] if versions else []
+    flags = [f"-Wl,--version-script={script}"] if versions else []
     target.unlink()
-    run("gcc", "-shared", "-fPIC", f"-Wl,-soname,{target.name}", *chosen, source, "-o", target)
+    run("gcc", "-shared", "-fPIC", f"-Wl,-soname,{target.name}", *flags, source, "-o", target)
 
 
 def compress(folder: Path, target: Path) -> None:
@@ -168,12 +168,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", type=Path, default=ROOT / ".gpu", help="what travels; default: .gpu")
     parser.add_argument("--parts", nargs="*", choices=parts, default=[*parts], help="others stay as they are")
-    asked = parser.parse_args()
-    asked.folder.mkdir(parents=True, exist_ok=True)
-    for name in asked.parts:
+    options = parser.parse_args()
+    options.folder.mkdir(parents=True, exist_ok=True)
+    for name in options.parts:
         with TemporaryDirectory() as work:
-            parts[name](asked.folder.resolve(), Path(work))
-    sizes = {path: path.stat().st_size for path in sorted(asked.folder.rglob("*")) if path.is_file()}
+            parts[name](options.folder.resolve(), Path(work))
+    sizes = {path: path.stat().st_size for path in sorted(options.folder.rglob("*")) if path.is_file()}
     for path, size in sizes.items():
         print(f"{size / 2**20:6.1f} MiB {path}")
     print(f"{sum(sizes.values()) / 2**20:6.1f} MiB in all")

@@ -35,7 +35,7 @@ def facts(file: Path) -> None:
         egl=[line.strip() for line in _output("ldconfig", "-p").splitlines() if "libEGL" in line],
         vendors=[str(path) for path in Path("/usr/share/glvnd/egl_vendor.d").glob("*.json")],
     )
-    update(file, mujoco=_tried(_mujoco), moderngl=_tried(_moderngl))
+    update(file, mujoco=_result_of(_mujoco), moderngl=_result_of(_moderngl))
     if torch.cuda.is_available():
         update(file, limits=_limits())
 
@@ -47,7 +47,7 @@ def _output(*command: str) -> str:
         return f"{type(error).__name__}: {error}"
 
 
-def _tried(work: Callable[[], Any]) -> Any:
+def _result_of(work: Callable[[], Any]) -> Any:
     try:
         return work()
     except Exception as error:  # of a driver, of any kind: it is the finding
@@ -87,24 +87,24 @@ def _limits() -> dict[str, float]:
         torch.cuda.synchronize()
         return sorted(begin.elapsed_time(end) for begin, end in marks[3:])[(count - 3) // 2] / 1000
 
-    found = {}
+    rates = {}
     pinned = torch.empty(COPIED // 16, dtype=torch.uint8).pin_memory()
-    found["to_device_gb_s"] = pinned.nbytes / seconds(lambda: pinned.to("cuda", non_blocking=True)) / 1e9
+    rates["to_device_gb_s"] = pinned.nbytes / seconds(lambda: pinned.to("cuda", non_blocking=True)) / 1e9
     pair = torch.empty(2, COPIED, dtype=torch.uint8, device="cuda")
-    found["copy_tb_s"] = 2 * COPIED / seconds(lambda: pair[0].copy_(pair[1])) / 1e12  # read and written
+    rates["copy_tb_s"] = 2 * COPIED / seconds(lambda: pair[0].copy_(pair[1])) / 1e12  # read and written
     kinds = {"bf16": (torch.bfloat16, "high"), "tf32": (torch.float32, "high"), "fp32": (torch.float32, "highest")}
     for name, (dtype, precision) in kinds.items():
         torch.set_float32_matmul_precision(precision)
         matrix = torch.randn(MATRIX, MATRIX, device="cuda").to(dtype)
-        found[f"{name}_tflop_s"] = 2 * MATRIX**3 / seconds(lambda matrix=matrix: matrix @ matrix) / 1e12
-    small = torch.zeros(64, device="cuda")
+        rates[f"{name}_tflop_s"] = 2 * MATRIX**3 / seconds(lambda matrix=matrix: matrix @ matrix) / 1e12
+    vector = torch.zeros(64, device="cuda")
     torch.cuda.synchronize()
-    began = time.perf_counter()
+    start = time.perf_counter()
     for _ in range(2000):
-        small.add_(1)
+        vector.add_(1)
     torch.cuda.synchronize()
-    found["launch_us"] = 1e6 * (time.perf_counter() - began) / 2000
-    return {name: round(value, 3) for name, value in found.items()}
+    rates["launch_us"] = 1e6 * (time.perf_counter() - start) / 2000
+    return {name: round(value, 3) for name, value in rates.items()}
 
 
 def latency(file: Path, demonstrations: str, episodes: str, plans: str, compiled: str, *models: str) -> None:
@@ -115,15 +115,15 @@ def latency(file: Path, demonstrations: str, episodes: str, plans: str, compiled
     from vla.config.experiment import Experiment
     from vla.data.episodes import EpisodeStore
 
-    store, found = EpisodeStore(Path(demonstrations), int(episodes)), dict[str, Any]()
+    store, rows = EpisodeStore(Path(demonstrations), int(episodes)), dict[str, Any]()
     for name in models:
         config = compose("job=train", *f"model={name}".split(","), f"collect.folder={demonstrations}", "output=unused")
         model = Experiment.of(config).fitted_learner(store).model
         for precision in ("fp32", "bf16")[: 1 + torch.cuda.is_available()]:
             for graphs in (False, True)[: 1 + (compiled == "True")]:
-                row = _tried(partial(_times, model, precision, graphs, int(plans)))
-                found.setdefault(name, {})[f"{precision}{' compiled' if graphs else ''}"] = row
-                update(file, latency=found)
+                row = _result_of(partial(_times, model, precision, graphs, int(plans)))
+                rows.setdefault(name, {})[f"{precision}{' compiled' if graphs else ''}"] = row
+                update(file, latency=rows)
 
 
 def _times(model: Any, precision: Any, compiled: bool, plans: int) -> dict[str, float]:
@@ -134,19 +134,19 @@ def _times(model: Any, precision: Any, compiled: bool, plans: int) -> dict[str, 
     from vla.policy import Policy
 
     torch._dynamo.reset()
-    began, random = time.perf_counter(), np.random.default_rng(0)
+    begin, random = time.perf_counter(), np.random.default_rng(0)
     policy = Policy("auto", precision, compiled, 1, model=model, spec=model.spec)
     observations = [policy.spec.random_observation(random) for _ in range(8)]
     for index in range(2 * policy.history + 6):
         policy.plan(observations[index % 8])
-    warm, times = time.perf_counter() - began, []
+    warm_up, times = time.perf_counter() - begin, []
     for index in range(plans):
         started = time.perf_counter()
         policy.plan(observations[index % 8])
         times.append(1000 * (time.perf_counter() - started))
-    found = {f"p{share}_ms": float(np.percentile(times, share)) for share in (50, 99, 100)}
-    return {name: round(value, 3) for name, value in found.items()} | {"warm_s": round(warm, 1)}
+    percentiles = {f"p{share}_ms": float(np.percentile(times, share)) for share in (50, 99, 100)}
+    return {name: round(value, 3) for name, value in percentiles.items()} | {"warm_s": round(warm_up, 1)}
 
 
 if __name__ == "__main__":
-    {each.__name__: each for each in (facts, latency)}[sys.argv[1]](Path(sys.argv[2]), *sys.argv[3:])
+    {measure.__name__: measure for measure in (facts, latency)}[sys.argv[1]](Path(sys.argv[2]), *sys.argv[3:])

@@ -23,7 +23,7 @@ DETAIL = Detail(6000, 2500, 3000, 256)  # of the pictures, which is to leave phy
 
 def main() -> None:
     """Compare every task of a folder."""
-    worst, agreed, judged = 0.0, 0, 0
+    worst, agreements, total = 0.0, 0, 0
     for file in sorted(Path(sys.argv[1]).glob("*.npz")):
         suite, _, number = file.stem.removeprefix("libero_").rpartition("_")  # of 10_swap: long_swap
         task, reference = tasks_of(suite.replace("10", "long"))[int(number)], np.load(file)
@@ -36,18 +36,18 @@ def main() -> None:
             controller.step(data, command)
             joints.append(data.qpos.copy())
         difference = np.abs(np.array(joints) - reference["joints"])
-        holds = []
+        verdicts = []
         for positions in reference["positions"]:
             data.qpos[:], data.qvel[:] = positions, 0
             mujoco.mj_forward(model, data)
-            holds.append([goal.holds(data, *part) for part in task.goal])
-        same = np.array(holds) == reference["holds"]
-        worst, agreed, judged = max(worst, difference[:, :7].max()), agreed + same.sum(), judged + same.size
+            verdicts.append([goal.holds(data, *part) for part in task.goal])
+        matches = np.array(verdicts) == reference["holds"]
+        worst, agreements, total = max(worst, difference[:, :7].max()), agreements + matches.sum(), total + matches.size
         print(
             f"{task.name:10} arm {difference[:, :7].max():.1e} rad, all {difference.max():.1e}; "
-            f"{same.sum()} of {same.size} judgements, {reference['holds'].mean(axis=0).round(2)} hold"
+            f"{matches.sum()} of {matches.size} judgements, {reference['holds'].mean(axis=0).round(2)} hold"
         )
-    print(f"arm within {worst:.1e} rad; {agreed} of {judged} judgements agree")
+    print(f"arm within {worst:.1e} rad; {agreements} of {total} judgements agree")
 
 
 if __name__ == "__main__":

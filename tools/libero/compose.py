@@ -46,14 +46,14 @@ def relative(xml: str) -> str:
 def composed(task: Any) -> tuple[str, dict[str, Any]]:
     """Return the MJCF of a task and what else its world needs to know."""
     file = Path(get_libero_path("bddl_files")) / task.problem_folder / task.bddl_file
-    outer = ControlEnv(str(file), has_offscreen_renderer=False, use_camera_obs=False)
+    world = ControlEnv(str(file), has_offscreen_renderer=False, use_camera_obs=False)
     np.random.seed(FIXTURE_SEED)
-    outer.reset()
-    env = outer.env
+    world.reset()
+    env = world.env
     model = env.sim.model._model
     fixtures = {name: env.obj_body_id[name] for name in env.fixtures_dict}
     facts = {
-        "instruction": outer.language_instruction if task.problem_folder.endswith(SENTENCES) else task.language,
+        "instruction": world.language_instruction if task.problem_folder.endswith(SENTENCES) else task.language,
         "problem": f"{task.problem_folder}/{task.bddl_file}",
         "states": f"{task.problem_folder}/{task.init_states_file}",
         "goal": env.parsed_problem["goal_state"],
@@ -73,7 +73,7 @@ def composed(task: Any) -> tuple[str, dict[str, Any]]:
         },
     }
     xml = relative(env.model.get_xml())
-    outer.close()
+    world.close()
     return xml, facts
 
 

@@ -24,17 +24,17 @@ def balanced(holds: np.ndarray) -> np.ndarray:
 
 def main() -> None:
     """Write the file."""
-    folder, kept = Path(sys.argv[1]), {}
+    folder, arrays = Path(sys.argv[1]), {}
     for name in MOVED:
         with np.load(folder / f"{name}.npz") as reference:
-            kept[f"{name} commands"] = reference["commands"][:STEPS]
-            kept[f"{name} joints"] = reference["joints"][:STEPS, :7]
+            arrays[f"{name} commands"] = reference["commands"][:STEPS]
+            arrays[f"{name} joints"] = reference["joints"][:STEPS, :7]
     for name in JUDGED:
         with np.load(folder / f"{name}.npz") as reference:
             rows = balanced(reference["holds"])
-            kept[f"{name} positions"] = reference["positions"][rows].astype(np.float32)
-            kept[f"{name} holds"] = reference["holds"][rows]
-    np.savez_compressed(sys.argv[2], **kept)
+            arrays[f"{name} positions"] = reference["positions"][rows].astype(np.float32)
+            arrays[f"{name} holds"] = reference["holds"][rows]
+    np.savez_compressed(sys.argv[2], **arrays)
 
 
 if __name__ == "__main__":

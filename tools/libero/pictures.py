@@ -44,32 +44,32 @@ class Original:
         option.geomgroup[:] = [group == VISIBLE for group in range(mujoco.mjNGROUP)]
         option.sitegroup[:] = 1
         with closing(mujoco.Renderer(model, *environment.spec.image_size)) as renderer:
-            drawn = []
+            pictures = []
             for camera in environment.spec.cameras:
                 renderer.update_scene(data, camera, option)
-                drawn.append(renderer.render()[:, ::-1])  # mirrored, as published
-        return drawn
+                pictures.append(renderer.render()[:, ::-1])  # mirrored, as published
+        return pictures
 
 
 def main() -> None:
     """Compare all tasks, or those of the sheet that are named."""
     options = [argument for argument in sys.argv[1:] if "=" in argument]
-    sheet, *shown = [argument for argument in sys.argv[1:] if argument not in options] or [None]
+    sheet, *names = [argument for argument in sys.argv[1:] if argument not in options] or [None]
     original, rows, differences = Original(), [], []
     with closing(Experiment.of(compose("task=libero", "output=none", *options)).make_environment()()) as environment:
         assert isinstance(environment, Libero)
-        if unknown := {*shown} - {*environment.tasks}:
+        if unknown := {*names} - {*environment.tasks}:
             raise SystemExit(f"there are no tasks {', '.join(map(str, unknown))}; there is {environment.tasks[0]}")
         for number, name in enumerate(environment.tasks):
             suite, _, place = name.rpartition("_")
-            seen = environment.reset(FIRST_SEED + (number - FIRST_SEED) % len(environment.tasks))
-            theirs = original.pictures(tasks_of(suite)[int(place)].scene, environment)
-            ours = [seen.rgb[camera] for camera in environment.spec.cameras]
-            pairs = list(zip(theirs, ours, strict=True))
-            differences.append([np.abs(one.astype(int) - other).mean() for one, other in pairs])
+            observation = environment.reset(FIRST_SEED + (number - FIRST_SEED) % len(environment.tasks))
+            originals = original.pictures(tasks_of(suite)[int(place)].scene, environment)
+            pictures = [observation.rgb[camera] for camera in environment.spec.cameras]
+            pairs = list(zip(originals, pictures, strict=True))
+            differences.append([np.abs(picture.astype(int) - reference).mean() for picture, reference in pairs])
             print(f"{name:10}", " ".join(f"{difference:5.2f}" for difference in differences[-1]), flush=True)
-            if name in (shown or environment.tasks):
-                rows.append(np.concatenate([*theirs, *ours], axis=1))
+            if name in (names or environment.tasks):
+                rows.append(np.concatenate([*originals, *pictures], axis=1))
     print(f"mean {np.mean(differences):.2f}, worst task {np.max(np.mean(differences, axis=1)):.2f}")
     if sheet:
         Image.fromarray(np.concatenate(rows)).save(sheet, quality=90)

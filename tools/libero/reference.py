@@ -47,17 +47,17 @@ def disturbed(env: Any, random: np.random.Generator) -> np.ndarray:
 def measured(task: Any, seed: int) -> dict[str, Any]:
     """Play and judge one task."""
     file = Path(get_libero_path("bddl_files")) / task.problem_folder / task.bddl_file
-    outer = ControlEnv(str(file), has_offscreen_renderer=False, use_camera_obs=False, ignore_done=True, horizon=100000)
+    world = ControlEnv(str(file), has_offscreen_renderer=False, use_camera_obs=False, ignore_done=True, horizon=100000)
     np.random.seed(FIXTURE_SEED)
-    outer.reset()
+    world.reset()
     states = np.load(Path(get_libero_path("init_states")) / task.problem_folder / f"{task.init_states_file}.npz")
-    outer.set_init_state(states["states"][0])
-    random, env = np.random.default_rng(seed), outer.env
-    given, joints = commands(random), []
-    for command in given:
-        outer.step(command)
+    world.set_init_state(states["states"][0])
+    random, env = np.random.default_rng(seed), world.env
+    actions, joints = commands(random), []
+    for command in actions:
+        world.step(command)
         joints.append(env.sim.data.qpos.copy())
-    positions, holds = [], []
+    positions, verdicts = [], []
     start = joints[SETTLE]
     for _ in range(STATES):
         env.sim.data.qpos[:], env.sim.data.qvel[:] = start, 0
@@ -65,13 +65,13 @@ def measured(task: Any, seed: int) -> dict[str, Any]:
         positions.append(disturbed(env, random))
         env.sim.data.qpos[:] = positions[-1]
         env.sim.forward()
-        holds.append([env._eval_predicate(part) for part in env.parsed_problem["goal_state"]])
-    outer.close()
+        verdicts.append([env._eval_predicate(part) for part in env.parsed_problem["goal_state"]])
+    world.close()
     return {
-        "commands": given,
+        "commands": actions,
         "joints": np.array(joints),
         "positions": np.array(positions),
-        "holds": np.array(holds, bool),
+        "holds": np.array(verdicts, bool),
     }
 
 
@@ -84,8 +84,8 @@ def main() -> None:
         with contextlib.redirect_stdout(io.StringIO()):
             suite = benchmark.get_benchmark_dict()[name]()
         for number in range(suite.get_num_tasks()):
-            found = measured(suite.get_task(number), number)
-            np.savez_compressed(folder / f"{name}_{number}.npz", allow_pickle=False, **found)
+            results = measured(suite.get_task(number), number)
+            np.savez_compressed(folder / f"{name}_{number}.npz", allow_pickle=False, **results)
             print(name, number, flush=True)
 
 

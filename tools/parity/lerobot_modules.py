@@ -55,10 +55,10 @@ def processors_of(folder: Path) -> tuple[Any, ...]:
     from lerobot.processor import PolicyProcessorPipeline
     from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
 
-    after = {"to_transition": policy_action_to_transition, "to_output": transition_to_policy_action}
+    converters = {"to_transition": policy_action_to_transition, "to_output": transition_to_policy_action}
     return tuple(
         PolicyProcessorPipeline.from_pretrained(folder, config_filename=f"policy_{part}.json", **options)
-        for part, options in (("preprocessor", {}), ("postprocessor", after))
+        for part, options in (("preprocessor", {}), ("postprocessor", converters))
     )
 
 

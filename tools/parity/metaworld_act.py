@@ -33,30 +33,30 @@ UNITS = np.array([100, 100, 100, -1], np.float32)  # LeRobot's actions are in cm
 def main(run: str, folder: str, seed: str, episodes: str, output: str, tasks: str = "") -> None:
     """Play the episodes of all tasks, or of the named ones, without videos, and write their successes."""
     torch.set_num_threads(1)
-    saved = read_policy(run)
-    spec = saved.spec
-    every = (f"{name}-v3" for names in saved.config["task"]["tiers"].values() for name in names)
+    saved_policy = read_policy(run)
+    spec = saved_policy.spec
+    task_names = (f"{name}-v3" for names in saved_policy.config["task"]["tiers"].values() for name in names)
     config = PreTrainedConfig.from_pretrained(folder, local_files_only=True)
     config.device, config.pretrained_path = "cpu", Path(folder)
     policy = get_policy_class(config.type).from_pretrained(folder, config=config).eval()
-    before, after = make_pre_post_processors(config, folder)
+    preprocessor, postprocessor = make_pre_post_processors(config, folder)
 
     def see(batch: dict[str, Any]) -> dict[str, Any]:
-        known = {key: value.numpy() if isinstance(value, torch.Tensor) else value for key, value in batch.items()}
-        seen = [arrays(replace(each, rgb={**spec.images(each)}), spec) for each in observations(known, spec)]
-        return {key: torch.from_numpy(np.stack([each[key] for each in seen])) for key in seen[0]} | {TASK: batch[TASK]}
+        inputs = {key: value.numpy() if isinstance(value, torch.Tensor) else value for key, value in batch.items()}
+        rows = [arrays(replace(step, rgb={**spec.images(step)}), spec) for step in observations(inputs, spec)]
+        return {key: torch.from_numpy(np.stack([step[key] for step in rows])) for key in rows[0]} | {TASK: batch[TASK]}
 
     def act(batch: dict[str, Any]) -> dict[str, Any]:
         low, high = torch.tensor(spec.low), torch.tensor(spec.high)
         return {ACTION: batch[ACTION].clamp(low, high) * torch.from_numpy(UNITS)}
 
     info = eval_policy_all(
-        envs=make_env(MetaworldEnv(task=tasks or ",".join(every))),
+        envs=make_env(MetaworldEnv(task=tasks or ",".join(task_names))),
         policy=policy,
         env_preprocessor=see,
         env_postprocessor=act,
-        preprocessor=before,
-        postprocessor=after,
+        preprocessor=preprocessor,
+        postprocessor=postprocessor,
         n_episodes=int(episodes),
         start_seed=int(seed),
     )

@@ -75,8 +75,8 @@ def play(world: Any, server: Server, sentence: str, seed: int) -> bool:
     step = 0
     while step < STEPS:
         picture = np.ascontiguousarray(np.flip(world.render(), (0, 1)))
-        seen = {"observation/image": picture, "observation/state": values[:4].astype(np.float32), "prompt": sentence}
-        for action in server.ask(seen)["actions"][: server.about["execute"]]:
+        request = {"observation/image": picture, "observation/state": values[:4].astype(np.float32), "prompt": sentence}
+        for action in server.ask(request)["actions"][: server.about["execute"]]:
             values, _, _, _, info = world.step(np.clip(action * UNITS, -1, 1))
             step += 1
             if info["success"]:
@@ -90,7 +90,7 @@ def main(seed: str, episodes: str, output: str, tasks: str = "", url: str = "ws:
     """Play the episodes of every task, and write their successes after each."""
     conf = Path(__file__).parents[2] / "conf/task/metaworld.yaml"
     sentences = yaml.safe_load(conf.read_text(encoding="utf-8"))["sentences"]  # LeRobot's
-    played = []
+    results = []
     Path(output).mkdir(parents=True, exist_ok=True)
     with connect(url, max_size=None, compression=None) as socket:
         server = Server(socket)
@@ -98,8 +98,8 @@ def main(seed: str, episodes: str, output: str, tasks: str = "", url: str = "ws:
             world = make_world(f"{task}-v3")
             successes = [play(world, server, sentences[task], int(seed) + index) for index in range(int(episodes))]
             world.close()
-            played.append({"task_group": f"{task}-v3", "metrics": {"successes": successes}})
-            (Path(output) / "eval_info.json").write_text(json.dumps({"per_task": played}), encoding="utf-8")
+            results.append({"task_group": f"{task}-v3", "metrics": {"successes": successes}})
+            (Path(output) / "eval_info.json").write_text(json.dumps({"per_task": results}), encoding="utf-8")
             print(f"{task:28} {sum(successes)} of {episodes}", flush=True)
 
 

@@ -27,51 +27,51 @@ from vla.rollouts.statistics import wilson_interval
 
 def theirs(folder: Path) -> Iterator[tuple[str, list[bool]]]:
     """Yield the tasks of an evaluation by LeRobot, with the success of each episode."""
-    for each in json.loads((folder / "eval_info.json").read_text(encoding="utf-8"))["per_task"]:
-        if not each["task_group"].endswith("-v3"):
-            raise SystemExit(f"{folder} has the group {each['task_group']}: evaluate tasks by name, such as reach-v3")
-        yield each["task_group"].removesuffix("-v3"), each["metrics"]["successes"]
+    for group in json.loads((folder / "eval_info.json").read_text(encoding="utf-8"))["per_task"]:
+        if not group["task_group"].endswith("-v3"):
+            raise SystemExit(f"{folder} has the group {group['task_group']}: evaluate tasks by name, such as reach-v3")
+        yield group["task_group"].removesuffix("-v3"), group["metrics"]["successes"]
 
 
 def ours(run: str, policy: Policy, task: str, seeds: range) -> list[bool]:
     """Return the success of each episode here."""
     world = load_environment(run, changes={"tasks": [task]})
-    played = [rollout(world.environment, policy, seed).success for seed in seeds]
+    successes = [rollout(world.environment, policy, seed).success for seed in seeds]
     world.close()
-    return played
+    return successes
 
 
 def main(run: str, first: str, *folders: str) -> None:
     """Print the successes in both, by task, and compare them in pairs."""
     tiers: dict[str, Any] = read_policy(run).config["task"]["tiers"]
-    both: dict[str, tuple[list[bool], list[bool]]] = {}
+    outcomes: dict[str, tuple[list[bool], list[bool]]] = {}
     policy = load_policy(run, device="cpu")
     for folder in folders:
-        for task, there in theirs(Path(folder)):
-            before = both.setdefault(task, ([], []))
-            seed = int(first) + len(before[0])
-            here = ours(run, policy, task, range(seed, seed + len(there)))
-            both[task] = before[0] + here, before[1] + there
-            print(f"{task:28} here {sum(here)}, in LeRobot {sum(there)} of {len(there)}", flush=True)
+        for task, lerobot in theirs(Path(folder)):
+            previous = outcomes.setdefault(task, ([], []))
+            seed = int(first) + len(previous[0])
+            local = ours(run, policy, task, range(seed, seed + len(lerobot)))
+            outcomes[task] = previous[0] + local, previous[1] + lerobot
+            print(f"{task:28} here {sum(local)}, in LeRobot {sum(lerobot)} of {len(lerobot)}", flush=True)
     for number, place in enumerate(("here", "in LeRobot")):
-        won = [success for pair in both.values() for success in pair[number]]
-        low, high = wilson_interval(sum(won), len(won))
+        wins = [success for pair in outcomes.values() for success in pair[number]]
+        low, high = wilson_interval(sum(wins), len(wins))
         means = [
-            np.mean([np.mean(both[task][number]) for task in tasks if task in both])
+            np.mean([np.mean(outcomes[task][number]) for task in tasks if task in outcomes])
             for tasks in tiers.values()
-            if {*tasks} & {*both}
+            if {*tasks} & {*outcomes}
         ]
         print(
-            f"{place}: {sum(won)} of {len(won)}, {100 * low:.1f}-{100 * high:.1f} %, tiers {100 * np.mean(means):.1f}"
+            f"{place}: {sum(wins)} of {len(wins)}, {100 * low:.1f}-{100 * high:.1f} %, tiers {100 * np.mean(means):.1f}"
         )
-    episodes = [pair for here, there in both.values() for pair in zip(here, there, strict=True)]
-    both_won, lost, won = (
+    episodes = [pair for local, lerobot in outcomes.values() for pair in zip(local, lerobot, strict=True)]
+    both_won, losses, wins = (
         sum(pair == kind for pair in episodes) for kind in ((True, True), (True, False), (False, True))
     )
-    result = compare_pairs(Pairs(both_won, lost, won, len(episodes) - both_won - lost - won))
+    result = compare_pairs(Pairs(both_won, losses, wins, len(episodes) - both_won - losses - wins))
     print(
         f"in LeRobot minus here: {100 * result.difference:.1f} points ({100 * result.ci_low:.1f} to "
-        f"{100 * result.ci_high:.1f}), {won} won, {lost} lost, p = {result.p:.3f}"
+        f"{100 * result.ci_high:.1f}), {wins} won, {losses} lost, p = {result.p:.3f}"
     )
 
 

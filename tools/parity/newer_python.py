@@ -11,12 +11,12 @@ GENERIC = re.compile(r"^(class|def) (\w+)\[([^\]]+)\]\(", re.MULTILINE)
 
 
 def _with_variables(match: re.Match[str]) -> str:
-    kind, name, listed = match.groups()
+    kind, name, parameters = match.groups()
     if kind == "class":  # its variables exist in the module
-        return f'class {name}(__import__("typing").Generic[{listed}], '
-    variables = [each.partition(":")[0].strip() for each in listed.split(",")]
-    made = [f'{each} = __import__("typing").TypeVar("{each}")\n' for each in variables]
-    return f"{''.join(made)}def {name}("
+        return f'class {name}(__import__("typing").Generic[{parameters}], '
+    variables = [parameter.partition(":")[0].strip() for parameter in parameters.split(",")]
+    definitions = [f'{variable} = __import__("typing").TypeVar("{variable}")\n' for variable in variables]
+    return f"{''.join(definitions)}def {name}("
 
 
 def _prepare() -> None:

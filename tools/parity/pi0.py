@@ -23,18 +23,18 @@ GRADIENTS = (  # of the network, by its names here
 
 def their_name(name: str) -> str:
     """Return what transformers calls a weight that is called `name` here."""
-    for here, there in (("paligemma.", "model.vlm."), ("expert.", "model.dit."), ("action_out_", "action_out_")):
-        if name.startswith(here):
-            return there + name.removeprefix(here)
+    for prefix, target in (("paligemma.", "model.vlm."), ("expert.", "model.dit."), ("action_out_", "action_out_")):
+        if name.startswith(prefix):
+            return target + name.removeprefix(prefix)
     return f"embed_action_time.{name}"
 
 
 def their_network() -> PI0ForConditionalGeneration:
     """The network of transformers."""
-    shared = {"num_attention_heads": SIZES["heads"], "num_key_value_heads": 1, "head_dim": SIZES["head_width"]}
-    shared |= {"model_type": "gemma", "num_hidden_layers": SIZES["layers"], "vocab_size": SIZES["vocabulary"]}
-    text = {**shared, "hidden_size": SIZES["width"], "intermediate_size": SIZES["feedforward"]}
-    expert = {**shared, "hidden_size": SIZES["expert_width"], "intermediate_size": SIZES["expert_feedforward"]}
+    gemma = {"num_attention_heads": SIZES["heads"], "num_key_value_heads": 1, "head_dim": SIZES["head_width"]}
+    gemma |= {"model_type": "gemma", "num_hidden_layers": SIZES["layers"], "vocab_size": SIZES["vocabulary"]}
+    text = {**gemma, "hidden_size": SIZES["width"], "intermediate_size": SIZES["feedforward"]}
+    expert = {**gemma, "hidden_size": SIZES["expert_width"], "intermediate_size": SIZES["expert_feedforward"]}
     vision = {
         **{"model_type": "siglip_vision_model", "vision_use_head": False},
         **{"hidden_size": SIZES["vision_width"], "num_hidden_layers": SIZES["vision_layers"]},
@@ -70,10 +70,10 @@ def as_theirs(given: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def their_results(theirs: PI0ForConditionalGeneration, given: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return losses, (B, k, A), their gradients, and the actions at the beginning of every step and after the last."""
-    chosen = {"noise": given["noise"], "timestep": given["time"], "actions": given["actions"]}
-    losses = theirs(**as_theirs(given), **chosen).loss
+    targets = {"noise": given["noise"], "timestep": given["time"], "actions": given["actions"]}
+    losses = theirs(**as_theirs(given), **targets).loss
     losses.mean().backward()
-    named = dict(theirs.named_parameters())
+    parameters = dict(theirs.named_parameters())
     steps: list[Tensor] = []
 
     def record(module: Any, args: Any, values: dict[str, Any]) -> None:
@@ -82,17 +82,17 @@ def their_results(theirs: PI0ForConditionalGeneration, given: dict[str, Tensor])
     handle = theirs.register_forward_pre_hook(record, with_kwargs=True)
     steps.append(theirs.sample_actions(**as_theirs(given), noise=given["noise"]))
     handle.remove()
-    gradients = {f"gradient.{name}": named[their_name(name)].grad for name in GRADIENTS}
+    gradients = {f"gradient.{name}": parameters[their_name(name)].grad for name in GRADIENTS}
     return {"losses": losses.detach(), "steps": torch.stack(steps), **gradients}
 
 
 def main() -> None:
     """Write what the network of transformers computes."""
-    theirs, ours = their_network(), make_network("pi0")
-    unused = theirs.model.dit.embed_tokens.weight  # the expert reads no words
-    state = {their_name(name): weight for name, weight in ours.state_dict().items()}
-    theirs.load_state_dict({**state, "model.dit.embed_tokens.weight": unused})
-    write("pi0", their_results(theirs, inputs()))
+    reference, network = their_network(), make_network("pi0")
+    embedding = reference.model.dit.embed_tokens.weight  # the expert reads no words
+    state = {their_name(name): weight for name, weight in network.state_dict().items()}
+    reference.load_state_dict({**state, "model.dit.embed_tokens.weight": embedding})
+    write("pi0", their_results(reference, inputs()))
 
 
 if __name__ == "__main__":

@@ -48,15 +48,15 @@ LEROBOT: dict[str, tuple[Any, Any, Any, Any]] = {  # module, policy, its configu
 
 def their_policy(name: str) -> Any:
     """LeRobot's policy with a network of other sizes."""
-    module, kind, configured, _ = LEROBOT[name]
-    own = module.PaliGemmaForConditionalGenerationWithPiGemma
+    module, kind, config_class, _ = LEROBOT[name]
+    original = module.PaliGemmaForConditionalGenerationWithPiGemma
 
     def trunk(config: Any) -> Any:
         """Without the sizes that it sets in any case."""
         config.vision_config.projection_dim = config.text_config.hidden_size
         config.vision_config.intermediate_size = SIZES["vision_feedforward"]
         config.text_config.vocab_size = SIZES["vocabulary"]
-        return own(config=config)
+        return original(config=config)
 
     vision = {
         **{"hidden_size": SIZES["vision_width"], "num_hidden_layers": SIZES["vision_layers"]},
@@ -77,7 +77,7 @@ def their_policy(name: str) -> Any:
     size = SIZES["resolution"]
     images = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, size, size)) for name in CAMERAS}
     state = {"observation.state": PolicyFeature(FeatureType.STATE, (5,))}
-    config = configured(
+    config = config_class(
         **{"chunk_size": CHUNK, "n_action_steps": CHUNK, "max_action_dim": SIZES["action_width"], "device": "cpu"},
         **{"num_inference_steps": STEPS, "image_resolution": (size, size), "tokenizer_max_length": LENGTHS[name]},
         max_state_dim=STATE_WIDTH,
@@ -93,10 +93,10 @@ def their_policy(name: str) -> Any:
 
 def network_results(theirs: Any) -> dict[str, Tensor]:
     """Return losses, (B, k, A), their gradients, and the actions at the beginning of every step and after the last."""
-    given, steps, denoise = inputs(), [], theirs.denoise_step
-    images, cameras = ([*given[name].unbind(1)] for name in ("images", "cameras"))
-    known = (images, cameras, given["tokens"], given["sentence"])
-    losses = theirs(*known, given["actions"], given["noise"], given["time"])
+    batch, steps, denoise = inputs(), [], theirs.denoise_step
+    images, cameras = ([*batch[name].unbind(1)] for name in ("images", "cameras"))
+    observation = (images, cameras, batch["tokens"], batch["sentence"])
+    losses = theirs(*observation, batch["actions"], batch["noise"], batch["time"])
     losses.mean().backward()
 
     def recorded(**values: Any) -> Tensor:
@@ -104,17 +104,17 @@ def network_results(theirs: Any) -> dict[str, Tensor]:
         return denoise(**values)
 
     theirs.denoise_step = recorded
-    steps.append(theirs.sample_actions(*known, noise=given["noise"]))
+    steps.append(theirs.sample_actions(*observation, noise=batch["noise"]))
     theirs.denoise_step = denoise
-    named = dict(theirs.named_parameters())
-    gradients = {
-        f"gradient.{name}": named[
-            f"paligemma_with_expert.{there}{name.partition('.')[2].removeprefix('vision_tower.')}"
+    parameters = dict(theirs.named_parameters())
+    weights = {
+        f"gradient.{name}": parameters[
+            f"paligemma_with_expert.{prefix}{name.partition('.')[2].removeprefix('vision_tower.')}"
         ]
-        for name, there in GRADIENTS.items()
+        for name, prefix in GRADIENTS.items()
     }
-    found = {name: weight.grad for name, weight in gradients.items()}
-    return {"losses": losses.detach(), "steps": torch.stack(steps), **found}
+    gradients = {name: weight.grad for name, weight in weights.items()}
+    return {"losses": losses.detach(), "steps": torch.stack(steps), **gradients}
 
 
 def without_hub() -> None:
@@ -125,35 +125,35 @@ def without_hub() -> None:
 
 def raw() -> dict[str, Any]:
     """Return the observations as LeRobot's processors take them."""
-    given = observed()
+    batch = observed()
     images = {
         f"observation.images.{camera}": values.permute(0, 3, 1, 2).float() / 255
-        for camera, values in zip(CAMERAS, given["images"], strict=False)
+        for camera, values in zip(CAMERAS, batch["images"], strict=False)
     }
-    return {**images, "observation.state": given["state"], "action": given["actions"], "task": [*TASKS]}
+    return {**images, "observation.state": batch["state"], "action": batch["actions"], "task": [*TASKS]}
 
 
 def way_results(name: str, policy: Any) -> dict[str, Tensor]:
     """Return what LeRobot makes of raw observations, and the commands it makes of what the network answers."""
-    given = observed()
+    raw_batch = observed()
     statistics = {
         feature: {
-            each: given[f"{feature.rpartition('.')[2]}.{quantile}"]
-            for each, quantile in zip(STATISTICS[name], ("q01", "q99"), strict=True)
+            statistic: raw_batch[f"{feature.rpartition('.')[2]}.{quantile}"]
+            for statistic, quantile in zip(STATISTICS[name], ("q01", "q99"), strict=True)
         }
         for feature in ("observation.state", "action")
     }
-    before, after = LEROBOT[name][-1](policy.config, statistics)
-    batch = before(raw())
-    seen, present = policy._preprocess_images(batch)
+    preprocess, postprocess = LEROBOT[name][-1](policy.config, statistics)
+    batch = preprocess(raw())
+    pictures, masks = policy._preprocess_images(batch)
     return {
-        "way.image": seen[0],
-        "way.present": torch.stack(present, 1),
+        "way.image": pictures[0],
+        "way.present": torch.stack(masks, 1),
         "way.tokens": batch["observation.language.tokens"],
         "way.sentence": batch["observation.language.attention_mask"],
         "way.state": batch["observation.state"],
         "way.actions": policy.prepare_action(batch),
-        "way.commands": after(policy.predict_action_chunk(batch, noise=given["noise"])),
+        "way.commands": postprocess(policy.predict_action_chunk(batch, noise=raw_batch["noise"])),
     }
 
 
@@ -161,16 +161,16 @@ def exported_results(name: str, folder: Path) -> Tensor:
     """Return the commands of LeRobot's policy and processors that are loaded from what is exported here."""
     # With the newer transformers of this project, in which modules of the image encoder have other names.
     code = f"from tiny_pi import *; export({name!r}, Path({str(folder)!r}))"
-    ours = os.environ["PYTHONPATH"].partition(os.pathsep)[2]
-    subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": ours}, check=True)
-    theirs = LEROBOT[name][1].from_pretrained(folder / "exported")
-    state, written = theirs.state_dict(), load_file(folder / "exported/model.safetensors")
-    assert all(torch.equal(state[weight], tensor.float()) for weight, tensor in written.items())
+    path = os.environ["PYTHONPATH"].partition(os.pathsep)[2]
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path}, check=True)
+    policy = LEROBOT[name][1].from_pretrained(folder / "exported")
+    state, tensors = policy.state_dict(), load_file(folder / "exported/model.safetensors")
+    assert all(torch.equal(state[weight], tensor.float()) for weight, tensor in tensors.items())
     # That is the same matrix as that of the head.
-    missing = {"model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"}
-    assert state.keys() - written.keys() == missing
-    before, after = lerobot_modules.processors_of(folder / "exported")
-    return after(theirs.predict_action_chunk(before(raw()), noise=observed()["noise"]))
+    missing_weights = {"model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"}
+    assert state.keys() - tensors.keys() == missing_weights
+    preprocess, postprocess = lerobot_modules.processors_of(folder / "exported")
+    return postprocess(policy.predict_action_chunk(preprocess(raw()), noise=observed()["noise"]))
 
 
 def main() -> None:
@@ -178,13 +178,13 @@ def main() -> None:
     without_hub()
     for name in LEROBOT:
         policy = their_policy(name)
-        of_network = network_results(policy.model) if name == "pi05" else {}
-        results = {**of_network, **way_results(name, policy)}
-        write("pi05" if of_network else "pi0_policy", results)
+        network_part = network_results(policy.model) if name == "pi05" else {}
+        results = {**network_part, **way_results(name, policy)}
+        write("pi05" if network_part else "pi0_policy", results)
         with TemporaryDirectory() as folder:
-            off = deviation(exported_results(name, Path(folder)), results["way.commands"])
-            print(f"{name}: commands of our export {off:.1e}")
-            assert off <= TOLERANCE
+            error = deviation(exported_results(name, Path(folder)), results["way.commands"])
+            print(f"{name}: commands of our export {error:.1e}")
+            assert error <= TOLERANCE
 
 
 if __name__ == "__main__":

@@ -30,9 +30,9 @@ def rows(shapes: dict[str, list[int]]) -> list[list[Any]]:
     """Return name, layers and shape; layers of one kind are one row, with a star in place of their numbers."""
     layers = dict[str, set[int]]()
     for name in shapes:
-        found = re.search(r"\.layers\.(\d+)\.", name)
-        starred = name.replace(found[0], ".layers.*.") if found else name
-        layers.setdefault(starred, set()).update({int(found[1])} if found else set())
+        match = re.search(r"\.layers\.(\d+)\.", name)
+        pattern = name.replace(match[0], ".layers.*.") if match else name
+        layers.setdefault(pattern, set()).update({int(match[1])} if match else set())
     assert all(numbers == {*range(len(numbers))} for numbers in layers.values())
     return [
         [name, f"0:{len(numbers)}" if numbers else "", shapes[name.replace("*", "0")]]
@@ -45,12 +45,12 @@ def main() -> None:
     options: dict[str, Any] = {"dtype": "float32", "image_resolution": (224, 224), "max_action_dim": 32}
     options |= {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m", "max_state_dim": 32}
     options |= {"freeze_vision_encoder": False, "train_expert_only": False, "compile_model": False}
-    for kind, (repository, known) in PUBLISHED.items():
+    for kind, (repository, remark) in PUBLISHED.items():
         with torch.device("meta"):
             network = kind(SimpleNamespace(**options))
         shapes = {name: [*weight.shape] for name, weight in network.state_dict().items() if name != EMBEDDINGS}
         values = {
-            "source": SOURCE.format(name=kind.__name__, known=known),
+            "source": SOURCE.format(name=kind.__name__, known=remark),
             "tensors": len(shapes),
             "numbers": sum(math.prod(shape) for shape in shapes.values()),
         }

@@ -31,15 +31,15 @@ def main(path: str) -> None:
     noisy, previous = (torch.randn(BATCH, CHUNK, COMPONENTS, generator=random) for _ in range(2))
     results = {"linear": list[Tensor](), "exponential": list[Tensor]()}
     for decay, schedule in (("linear", RTCAttentionSchedule.LINEAR), ("exponential", RTCAttentionSchedule.EXP)):
-        for delay, rest, time, limit in CASES:
+        for delay, length, time, limit in CASES:
             config = RTCConfig(True, schedule, max_guidance_weight=limit, execution_horizon=CHUNK)
-            left, at = previous[:, :rest], torch.tensor(time)
+            prefix, instant = previous[:, :length], torch.tensor(time)
             velocity = RTCProcessor(config).denoise_step(
-                noisy, left, delay, at, lambda actions, at=at: (actions @ matrix + at).tanh()
+                noisy, prefix, delay, instant, lambda actions, instant=instant: (actions @ matrix + instant).tanh()
             )
             results[decay].append(velocity)
     arrays = {"matrix": matrix, "noisy": noisy, "previous": previous, "cases": torch.tensor(CASES)}
-    arrays |= {decay: torch.stack(found) for decay, found in results.items()}
+    arrays |= {decay: torch.stack(velocities) for decay, velocities in results.items()}
     np.savez_compressed(path, allow_pickle=False, **{name: values.numpy() for name, values in arrays.items()})
 
 

@@ -65,41 +65,41 @@ def trunk_config(sizes: dict[str, Any]) -> SmolVLMConfig:
 def their_results(network: VLAFlowMatching, given: dict[str, Tensor], gradients: list[str]) -> dict[str, Tensor]:
     """Losses, named gradients, and the noisy actions before every step of sampling and after the last."""
     images, cameras = ([*given[name].unbind(1)] for name in ("images", "cameras"))
-    observed = images, cameras, given["tokens"], given["sentence"], given["state"]
-    losses = network(*observed, given["actions"], given["noise"], given["time"])
+    batch = images, cameras, given["tokens"], given["sentence"], given["state"]
+    losses = network(*batch, given["actions"], given["noise"], given["time"])
     losses.mean().backward()
-    named, taken, denoise = dict(network.named_parameters()), list[Tensor](), network.denoise_step
+    parameters, samples, denoise = dict(network.named_parameters()), list[Tensor](), network.denoise_step
 
     def recorded(**values: Any) -> Tensor:
-        taken.append(values["x_t"])
+        samples.append(values["x_t"])
         return denoise(**values)
 
     network.denoise_step = recorded
     with torch.no_grad():
-        taken.append(network.sample_actions(*observed, noise=given["noise"]))
-    found = {f"gradient.{name}": named[name].grad for name in gradients}
-    return {"losses": losses.detach(), "steps": torch.stack(taken), **found}
+        samples.append(network.sample_actions(*batch, noise=given["noise"]))
+    grads = {f"gradient.{name}": parameters[name].grad for name in gradients}
+    return {"losses": losses.detach(), "steps": torch.stack(samples), **grads}
 
 
 def compare(name: str, ours: Tensor, theirs: Tensor) -> None:
     """Print the largest difference; fail above the tolerance."""
-    off = deviation(ours, theirs)
-    print(f"{name:70} {off:.1e}")
-    assert off <= TOLERANCE, name
+    error = deviation(ours, theirs)
+    print(f"{name:70} {error:.1e}")
+    assert error <= TOLERANCE, name
 
 
 def compare_networks() -> dict[str, Tensor]:
     """Compare losses, gradients and every step of sampling; returns LeRobot's."""
-    theirs, ours = their_network(trunk_config(SMOLVLA), CHUNK), SmolVLA(**SMOLVLA).eval()
-    fill(theirs.named_parameters())
-    fill(published(ours))
-    unmatched = {name for name, _ in theirs.named_parameters()} ^ {name for name, _ in published(ours)}
-    assert unmatched == {"vlm_with_expert.vlm.lm_head.weight"}, unmatched
-    found = network_results(ours, inputs(SMOLVLA))
-    gradients = [name.removeprefix("gradient.") for name in found if name.startswith("gradient.")]
-    results = their_results(theirs, inputs(SMOLVLA), gradients)
+    reference, network = their_network(trunk_config(SMOLVLA), CHUNK), SmolVLA(**SMOLVLA).eval()
+    fill(reference.named_parameters())
+    fill(published(network))
+    unmatched_names = {name for name, _ in reference.named_parameters()} ^ {name for name, _ in published(network)}
+    assert unmatched_names == {"vlm_with_expert.vlm.lm_head.weight"}, unmatched_names
+    our_results = network_results(network, inputs(SMOLVLA))
+    gradients = [name.removeprefix("gradient.") for name in our_results if name.startswith("gradient.")]
+    results = their_results(reference, inputs(SMOLVLA), gradients)
     for name, value in results.items():
-        compare(name, found[name], value)
+        compare(name, our_results[name], value)
     return results
 
 
@@ -107,25 +107,25 @@ def compare_policies(folder: Path) -> dict[str, Tensor]:
     """Compare what both do with raw observations; LeRobot's policy and processors are loaded from our export."""
     write_tokenizer(folder / "tokenizer")
     model = make_smolvla(folder / "tokenizer")
-    ours = as_policy(model, SPEC)
-    LeRobotPolicyExporter(folder / "exported").export(ours)
+    policy = as_policy(model, SPEC)
+    LeRobotPolicyExporter(folder / "exported").export(policy)
     without_hub(trunk_config(SMOLVLA))
-    theirs = SmolVLAPolicy.from_pretrained(folder / "exported", strict=True)
-    weights = dict(theirs.model.named_parameters())
+    reference = SmolVLAPolicy.from_pretrained(folder / "exported", strict=True)
+    weights = dict(reference.model.named_parameters())
     assert all(torch.equal(weights[name], weight) for name, weight in published(model.network))
-    before, after = lerobot_modules.processors_of(folder / "exported")
+    preprocess, postprocess = lerobot_modules.processors_of(folder / "exported")
     noise = torch.randn(1, CHUNK, SMOLVLA["action_width"], generator=torch.Generator().manual_seed(1))
     model.sample_noise = lambda random: noise
-    executed, acted = [], []
+    their_actions, our_actions = [], []
     for number in range(PLAYED):
-        seen = observation(number)
-        rows = {"observation.state": torch.from_numpy(seen.state), **raw_images(seen)}
-        given = before({**rows, "task": seen.instruction})
-        executed.append(after(theirs.select_action(given, noise=noise))[0])
-        acted.append(torch.from_numpy(ours.act(seen)))
-    compare(f"{PLAYED} executed actions", torch.stack(acted), torch.stack(executed))
-    results = {"policy.noise": noise, "policy.actions": torch.stack(executed)}
-    return results | compare_inputs(theirs, before, model)
+        step = observation(number)
+        rows = {"observation.state": torch.from_numpy(step.state), **raw_images(step)}
+        batch = preprocess({**rows, "task": step.instruction})
+        their_actions.append(postprocess(reference.select_action(batch, noise=noise))[0])
+        our_actions.append(torch.from_numpy(policy.act(step)))
+    compare(f"{PLAYED} executed actions", torch.stack(our_actions), torch.stack(their_actions))
+    results = {"policy.noise": noise, "policy.actions": torch.stack(their_actions)}
+    return results | compare_inputs(reference, preprocess, model)
 
 
 def raw_images(seen: Observation) -> dict[str, Tensor]:
@@ -135,29 +135,29 @@ def raw_images(seen: Observation) -> dict[str, Tensor]:
 
 def compare_inputs(theirs: SmolVLAPolicy, before: Any, model: Any) -> dict[str, Tensor]:
     """Compare images, state, tokens and actions as the networks get them."""
-    seen, known = observation(0), torch.from_numpy(steps(len(SPEC.action))[:CHUNK])
-    rows = {"observation.state": torch.from_numpy(seen.state), "action": known, **raw_images(seen)}
-    given = [before({**rows, "task": sentence}) for sentence in SENTENCES]
-    prepared, masks = theirs.prepare_images(given[0])
+    step, actions = observation(0), torch.from_numpy(steps(len(SPEC.action))[:CHUNK])
+    rows = {"observation.state": torch.from_numpy(step.state), "action": actions, **raw_images(step)}
+    batches = [before({**rows, "task": sentence}) for sentence in SENTENCES]
+    images, masks = theirs.prepare_images(batches[0])
     assert all(mask.all() for mask in masks)
-    pad = given[0]["observation.language.attention_mask"].new_tensor(-1, dtype=torch.int64)
+    pad = batches[0]["observation.language.attention_mask"].new_tensor(-1, dtype=torch.int64)
     tokens = [
-        torch.where(each["observation.language.attention_mask"], each["observation.language.tokens"], pad)
-        for each in given
+        torch.where(batch["observation.language.attention_mask"], batch["observation.language.tokens"], pad)
+        for batch in batches
     ]
     results = {
-        "way.images": torch.cat(prepared),
-        "way.state": theirs.prepare_state(given[0]),
-        "way.actions": theirs.prepare_action(given[0]).reshape(CHUNK, -1),
+        "way.images": torch.cat(images),
+        "way.state": theirs.prepare_state(batches[0]),
+        "way.actions": theirs.prepare_action(batches[0]).reshape(CHUNK, -1),
         "way.tokens": torch.cat(tokens),
     }
-    frames = torch.stack([torch.from_numpy(seen.rgb[camera]) for camera in SPEC.cameras])
+    frames = torch.stack([torch.from_numpy(step.rgb[camera]) for camera in SPEC.cameras])
     compare("images", model.image(frames), results["way.images"])
     state = model.state_normalizer(rows["observation.state"][None])
     compare(
         "state", torch.nn.functional.pad(state, (0, SMOLVLA["state_width"] - len(SPEC.state))), results["way.state"]
     )
-    compare("actions", model.scaled(known), results["way.actions"])
+    compare("actions", model.scaled(actions), results["way.actions"])
     assert torch.equal(model.text.tokenize([*SENTENCES]), results["way.tokens"])
     return results
 

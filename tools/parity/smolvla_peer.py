@@ -50,10 +50,10 @@ class Peer:
     def __init__(self, model: VisionLanguageAction) -> None:
         vlm: Any = model.network.vlm
         self.model, self.network = model, their_network(vlm.config, model.chunk)
-        named = dict(self.network.named_parameters())
+        parameters = dict(self.network.named_parameters())
         with torch.no_grad():
             for name, weight in published(model.network):
-                named[name].copy_(weight)
+                parameters[name].copy_(weight)
 
     def __call__(self, window: Batch) -> Tensor:
         """Return the actions of a window, (1, k, D)."""
@@ -61,8 +61,8 @@ class Peer:
         images = [model.image(window["rgb"][camera][:, -1]) for camera in model.cameras]
         state = model.state_normalizer(window["state"][:, -1].index_select(-1, model.robot_state.pose))
         tokens = F.pad(window["text"], (0, LENGTH - window["text"].shape[1]), value=PADDING)
-        padded = F.pad(state, (0, model.network.state_width - state.shape[-1]))
-        present = [image.new_ones(len(image), dtype=torch.bool) for image in images]
-        observed = images, present, tokens.clamp(min=0), tokens != PADDING, padded
-        actions = self.network.sample_actions(*observed, noise=model.noise[None])
+        padded_state = F.pad(state, (0, model.network.state_width - state.shape[-1]))
+        masks = [image.new_ones(len(image), dtype=torch.bool) for image in images]
+        inputs = images, masks, tokens.clamp(min=0), tokens != PADDING, padded_state
+        actions = self.network.sample_actions(*inputs, noise=model.noise[None])
         return model.action_normalizer.inverse(actions[..., : len(model.spec.action)])

@@ -18,7 +18,7 @@ ANSWER = 1.0  # longest time until a server accepts or rejects a goal [s]
 
 
 @dataclass(eq=False)
-class _Sent:
+class _SentGoal:
     """A goal that was sent."""
 
     at: float
@@ -54,7 +54,7 @@ class GoalSender:
         self.name = node.resolve_topic_name(name)
         self._node, self.kind, self._complaint, self._ended = node, kind, complaint, ended
         self._client = node.add_action_client(kind, name)
-        self._goals: list[_Sent] = []  # that have not ended, the newest last
+        self._goals: list[_SentGoal] = []  # that have not ended, the newest last
         self._failed = False
 
     def prepare(self) -> None:
@@ -76,10 +76,10 @@ class GoalSender:
     def send(self, goal: Any) -> None:
         """Send a goal, unless the server has failed."""
         if not self._failed:
-            sent = _Sent(time.monotonic())
-            self._goals.append(sent)
-            answered = self._node.guard(partial(self._on_answer, sent))
-            self._client.send_goal_async(goal).add_done_callback(answered)
+            sent_goal = _SentGoal(time.monotonic())
+            self._goals.append(sent_goal)
+            on_answer = self._node.guard(partial(self._on_answer, sent_goal))
+            self._client.send_goal_async(goal).add_done_callback(on_answer)
 
     def cancel(self) -> None:
         """Cancel the newest goal, if it has not ended."""
@@ -90,45 +90,45 @@ class GoalSender:
         """Fail if the server has vanished or does not answer."""
         if self._failed:
             return
-        unanswered = [sent.at for sent in self._goals if sent.handle is None]
+        sending_times = [goal.at for goal in self._goals if goal.handle is None]
         if not self._client.server_is_ready():
             self._give_up("has vanished")
-        elif unanswered and time.monotonic() - unanswered[0] > ANSWER:
+        elif sending_times and time.monotonic() - sending_times[0] > ANSWER:
             self._give_up(f"has not answered a goal for {ANSWER:g} s")
 
     def _forget(self) -> None:
-        for sent in self._goals:
-            sent.over = True
+        for goal in self._goals:
+            goal.over = True
         self._goals = []
 
-    def _give_up(self, what: str) -> None:
-        for sent in self._goals:
-            sent.cancel()
+    def _give_up(self, problem: str) -> None:
+        for goal in self._goals:
+            goal.cancel()
         self._forget()
         self._failed = True
-        self._node.fail(f"the action server {self.name} {what}")
+        self._node.fail(f"the action server {self.name} {problem}")
 
-    def _on_answer(self, sent: _Sent, future: Any) -> None:
+    def _on_answer(self, goal: _SentGoal, future: Any) -> None:
         handle = future.result()
         if not handle.accepted:
-            if not sent.over:
+            if not goal.over:
                 self._give_up("rejected a goal")
             return
-        sent.handle = handle
-        if sent.over or sent.cancelled:  # in the meantime
+        goal.handle = handle
+        if goal.over or goal.cancelled:  # in the meantime
             handle.cancel_goal_async()
-        if not sent.over:
-            handle.get_result_async().add_done_callback(self._node.guard(partial(self._on_result, sent)))
+        if not goal.over:
+            handle.get_result_async().add_done_callback(self._node.guard(partial(self._on_result, goal)))
 
-    def _on_result(self, sent: _Sent, future: Any) -> None:
-        if sent.over:
+    def _on_result(self, goal: _SentGoal, future: Any) -> None:
+        if goal.over:
             return
-        answer, newest = future.result(), sent is self._goals[-1]
-        self._goals.remove(sent)
-        sent.over = True
-        done = answer.status == GoalStatus.STATUS_SUCCEEDED or (newest and sent.cancelled)
-        if not done and (complaint := self._complaint(answer.result, not newest)):
-            what = "cancelled" if answer.status == GoalStatus.STATUS_CANCELED else "aborted"
-            self._give_up(f"{what} a goal: {complaint}")
-        elif newest:
+        answer, is_newest = future.result(), goal is self._goals[-1]
+        self._goals.remove(goal)
+        goal.over = True
+        done = answer.status == GoalStatus.STATUS_SUCCEEDED or (is_newest and goal.cancelled)
+        if not done and (complaint := self._complaint(answer.result, not is_newest)):
+            verb = "cancelled" if answer.status == GoalStatus.STATUS_CANCELED else "aborted"
+            self._give_up(f"{verb} a goal: {complaint}")
+        elif is_newest:
             self._ended()

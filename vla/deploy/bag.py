@@ -57,11 +57,11 @@ def messages_of(
     messages, types = reader.messages(connections, start, stop), message_types()
     while True:
         with bag_errors(folder):
-            found = next(messages, None)
-            if found is None:
+            entry = next(messages, None)
+            if entry is None:
                 return
-            connection, stamp, raw = found
-            message = types.deserialize_cdr(raw, connection.msgtype)
+            connection, stamp, data = entry
+            message = types.deserialize_cdr(data, connection.msgtype)
         yield connection.topic, stamp, message
 
 
@@ -71,5 +71,5 @@ def bag_errors(folder: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        why = shorten(" ".join(str(error).split()), 200) or type(error).__name__
-        raise UserError(f"{folder} is damaged or not a bag: {why}") from error
+        reason = shorten(" ".join(str(error).split()), 200) or type(error).__name__
+        raise UserError(f"{folder} is damaged or not a bag: {reason}") from error

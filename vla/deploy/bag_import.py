@@ -51,7 +51,7 @@ class _Picture(NamedTuple):
     taken: float
 
 
-class _Followed(NamedTuple):
+class _Assignment(NamedTuple):
     """The instruction that an arm follows at a time, and who moves it."""
 
     number: int  # of the instruction: the same one may be given again
@@ -89,9 +89,9 @@ class _Bag:
         self.measured: Track = []  # joints (J,) [rad] and opening [m], together (J + 1,)
         self.commands: Track = []  # (J,) [rad]
         self.openings: Track = []  # commanded, 0 … 1
-        self._followed: list[_Followed | None] = []  # at every joint state
+        self._assignments: list[_Assignment | None] = []  # at every joint state
         self._instruction, self._said_at, self._number = "", -np.inf, 0
-        self._used, self._dropped = set[str](), dict[str, str]()  # topics; topic → why its first message is unusable
+        self._used, self._problems = set[str](), dict[str, str]()  # topics; topic → why its first message is unusable
         with opened(folder) as reader:
             self.kinds = {connection.topic: connection.msgtype for connection in reader.connections}
             status = next((topic for topic in self.kinds if topic.endswith(STATUS)), None)
@@ -104,81 +104,81 @@ class _Bag:
                 **{topic: partial(self._see, camera) for camera, topic in topics.images.items()},
             }
             self._start = reader.start_time * 1e-9
-            read, expected = 0, sum(each.msgcount for each in reader.connections if each.topic in handlers)
+            count, total = 0, sum(source.msgcount for source in reader.connections if source.topic in handlers)
             for topic, stamp, message in messages_of(reader, handlers, folder):
-                read += 1
+                count += 1
                 try:
                     handlers[topic]((stamp - reader.start_time) * 1e-9, message)
                     self._used.add(topic)
                 except UserError as error:
-                    self._dropped.setdefault(topic, str(error))
+                    self._problems.setdefault(topic, str(error))
                 except (AttributeError, TypeError, ValueError):
-                    self._dropped.setdefault(topic, f"they are of type {messages.shorten(self.kinds[topic])}")
-        if read < expected:
-            raise UserError(f"{folder} is incomplete: {read} of {expected} messages are there, was its end cut off?")
+                    self._problems.setdefault(topic, f"they are of type {messages.shorten(self.kinds[topic])}")
+        if count < total:
+            raise UserError(f"{folder} is incomplete: {count} of {total} messages are there, was its end cut off?")
         self.require(topics.joint_states, topics.instruction)
 
     def require(self, *topics: str) -> None:
         """Raise a UserError unless there are usable messages on topics."""
         for topic in topics:
             if topic not in self.kinds:
-                known = messages.shorten(", ".join(sorted(self.kinds)) or "nothing", 500)
-                raise UserError(f"{self.folder} has no topic {topic}, it has {known}: choose others with expert.topics")
+                names = messages.shorten(", ".join(sorted(self.kinds)) or "nothing", 500)
+                raise UserError(f"{self.folder} has no topic {topic}, it has {names}: choose others with expert.topics")
             if topic not in self._used:
-                why = self._dropped.get(topic, "there are no messages")
-                raise UserError(f"{self.folder}: no message on {topic} can be used: {why}")
+                reason = self._problems.get(topic, "there are no messages")
+                raise UserError(f"{self.folder}: no message on {topic} can be used: {reason}")
 
     def segments(self) -> Iterator[_Segment]:
         """Yield the periods in which an instruction was followed, by a person only while the arm moves."""
-        for followed, group in groupby(zip(self._followed, self.measured, strict=True), key=itemgetter(0)):
-            if followed is None:
+        for assignment, group in groupby(zip(self._assignments, self.measured, strict=True), key=itemgetter(0)):
+            if assignment is None:
                 continue
-            times, positions = zip(*(measured for _, measured in group), strict=True)
+            times, positions = zip(*(sample for _, sample in group), strict=True)
             start, end = times[0], times[-1]
-            if followed.person:
-                scaled = np.array(positions) / [*[STILL] * len(self._limits.joints), STILL_OPENING]
-                left, on_way = (np.flatnonzero(np.abs(scaled - rest).max(1) > 1) for rest in (scaled[0], scaled[-1]))
+            if assignment.person:
+                points = np.array(positions) / [*[STILL] * len(self._limits.joints), STILL_OPENING]
+                left, on_way = (np.flatnonzero(np.abs(points - pose).max(1) > 1) for pose in (points[0], points[-1]))
                 start = max(times[left[0]] - LEAD, start) if len(left) else end
                 end = min(times[on_way[-1]] + LEAD, end) if len(on_way) else start
             if end - start >= SHORTEST:
-                yield _Segment(followed.instruction, followed.person, start, end)
+                yield _Segment(assignment.instruction, assignment.person, start, end)
 
     def sees(self, camera: str, segment: _Segment) -> bool:
         """Return whether there are images of a camera in a segment."""
-        first = bisect_left(self.inputs, segment.start, key=WHEN)
+        start = bisect_left(self.inputs, segment.start, key=WHEN)
         stop = bisect_right(self.inputs, segment.end, key=WHEN)
-        pictures = (each for _, each in self.inputs[first:stop] if isinstance(each, _Picture))
-        return any(each.camera == camera and each.taken >= segment.start for each in pictures)
+        pictures = (picture for _, picture in self.inputs[start:stop] if isinstance(picture, _Picture))
+        return any(picture.camera == camera and picture.taken >= segment.start for picture in pictures)
 
     def _see(self, camera: str, at: float, message: Any) -> None:
         if not hasattr(message, "format"):
             messages.image_from(message)  # compressed ones are decoded when they are needed
-        self.inputs.append((at, _Picture(camera, self._taken(at, message))))
+        self.inputs.append((at, _Picture(camera, self._capture_time(at, message))))
 
-    def _taken(self, at: float, message: Any) -> float:
+    def _capture_time(self, at: float, message: Any) -> float:
         """Return when a message's content was captured: its time stamp if plausible, else `at`, when it came."""
-        taken = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-        age = self._start + at - taken
-        return at - age if taken and 0 <= age < OLDEST else at
+        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        age = self._start + at - stamp
+        return at - age if stamp and 0 <= age < OLDEST else at
 
     def _measure(self, at: float, message: Any) -> None:
-        taken = self._taken(at, message)
-        if (measured := self._joint_states.read(message, taken)) is None:
+        stamp = self._capture_time(at, message)
+        if (reading := self._joint_states.read(message, stamp)) is None:
             raise UserError("they hold the fingers alone")
-        taken = max(taken, self.measured[-1][0]) if self.measured else taken
-        self.inputs.append((at, Measured(taken, *measured)))
-        self.measured.append((taken, np.append(measured[0], measured[2])))
-        followed = _Followed(self._number, self._instruction, bool(self._person))
-        self._followed.append(followed if self._instruction and self._person is not None else None)
+        stamp = max(stamp, self.measured[-1][0]) if self.measured else stamp
+        self.inputs.append((at, Measured(stamp, *reading)))
+        self.measured.append((stamp, np.append(reading[0], reading[2])))
+        assignment = _Assignment(self._number, self._instruction, bool(self._person))
+        self._assignments.append(assignment if self._instruction and self._person is not None else None)
 
     def _instruct(self, at: float, message: Any) -> None:
-        said = message.data.strip()
+        instruction = message.data.strip()
         if len(message.data) > LONGEST_INSTRUCTION:  # which the node drops
             raise UserError(f"an instruction of {len(message.data)} characters, the limit is {LONGEST_INSTRUCTION}")
-        if not said and self._has_status:  # which stops the node, and its status tells until when
+        if not instruction and self._has_status:  # which stops the node, and its status tells until when
             return
-        self._number += said != self._instruction or at - self._said_at > REPEATED
-        self._instruction, self._said_at = said, at
+        self._number += instruction != self._instruction or at - self._said_at > REPEATED
+        self._instruction, self._said_at = instruction, at
 
     def _hand_over(self, at: float, message: Any) -> None:
         values = {pair.key: pair.value for pair in message.values}
@@ -234,15 +234,15 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         bags = _read_bags(folder, topics, robot)
         for bag in bags:
             bag.require(*self._cameras)
-        found = _segments(bags, spec.cameras)
-        self._episodes = [(bag, segment, self._steps(bag, segment)) for bag, segment in found]
+        segments = _segments(bags, spec.cameras)
+        self._episodes = [(bag, segment, self._steps(bag, segment)) for bag, segment in segments]
         self._actions = [
             np.array([self._action(bag, segment, step.taken) for step in steps])
             for bag, segment, steps in self._episodes
         ]
         actions = np.concatenate(self._actions)
-        if wrong := imported.out_of_bounds(actions, spec, MOSTLY):
-            raise UserError(f"{folder} does not match the task: {'; '.join(wrong)}")
+        if problems := imported.out_of_bounds(actions, spec, MOSTLY):
+            raise UserError(f"{folder} does not match the task: {'; '.join(problems)}")
         imported.log_clipped(actions, spec)
 
     @classmethod
@@ -250,16 +250,16 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         cls, folder: Path | str | None, topics: Mapping[str, Any], robot: Mapping[str, Any]
     ) -> imported.Recording:
         """Describe bags: their state and action are the joints, see `ImportedDemonstrations.recording`."""
-        named = Topics(**{name: value for name, value in topics.items() if name != "_target_"})
+        bag_topics = Topics(**{name: value for name, value in topics.items() if name != "_target_"})
         limits = JointLimits(**{name: value for name, value in robot.items() if name != "_target_"})
-        bags, joints = _read_bags(folder, named, limits), tuple(limits.joints)
-        cameras = tuple(camera for camera, topic in named.images.items() if topic in bags[0].kinds)
-        bags[0].require(named.images[cameras[0]] if cameras else next(iter(named.images.values())))
+        bags, joints = _read_bags(folder, bag_topics, limits), tuple(limits.joints)
+        cameras = tuple(camera for camera, topic in bag_topics.images.items() if topic in bags[0].kinds)
+        bags[0].require(bag_topics.images[cameras[0]] if cameras else next(iter(bag_topics.images.values())))
         values = np.array([value[: len(joints)] for bag in bags for _, value in bag.commands or bag.measured]).T
-        bounds = {name: imported.action_bounds(each) for name, each in zip(joints, values, strict=True)}
-        pictures = (each for _, each in bags[0].inputs if isinstance(each, _Picture))
-        taken = [each.taken for each in pictures if each.camera == cameras[0]]
-        period = float(np.median(np.diff(taken))) if len(taken) > 1 else 0.0
+        bounds = {name: imported.action_bounds(series) for name, series in zip(joints, values, strict=True)}
+        pictures = (picture for _, picture in bags[0].inputs if isinstance(picture, _Picture))
+        times = [picture.taken for picture in pictures if picture.camera == cameras[0]]
+        period = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
         rate = round(1 / period, 1) if period > 0 else 1.0
         return imported.Recording(cameras, rate, joints, joints, bounds, len(_segments(bags, cameras)))
 
@@ -274,8 +274,8 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         images, rows = self._images(bag, steps), {"state": state}
         for camera in self.spec.cameras:
             rows[f"rgb_{camera}"] = np.array([images[camera, step.arrivals[camera]] for step in steps])
-        recorded = {"episode": number, "person": segment.person, "lacks": ["depth"] if self.spec.depth else []}
-        return self.recorded_episode(number, words, "unverified", recorded, rows, actions)
+        details = {"episode": number, "person": segment.person, "lacks": ["depth"] if self.spec.depth else []}
+        return self.recorded_episode(number, words, "unverified", details, rows, actions)
 
     def numbers(self, number: int) -> tuple[str, Array, Array]:
         """Return what is known of an episode without its images: instruction, state (N, P) and actions (N, D)."""
@@ -285,56 +285,56 @@ class BagDemonstrations(imported.ImportedDemonstrations):
     def _steps(self, bag: _Bag, segment: _Segment) -> list[_Step]:
         """Return the steps of a segment, made as the policy node makes observations; raise a UserError without any."""
         observer, steps, period = Observer(self.spec), list[_Step](), 1 / self.spec.control_hz
-        first = bisect_left(bag.inputs, segment.start - HISTORY, key=WHEN)
+        start = bisect_left(bag.inputs, segment.start - HISTORY, key=WHEN)
         stop = bisect_right(bag.inputs, segment.end, key=WHEN)
         last, nominal, longest = -np.inf, -np.inf, 0.0  # time of the last step, due time of the next, longest gap [s]
-        for now, each in bag.inputs[first:stop]:
-            if isinstance(each, Measured):
-                observer.add_joint_state(each)
+        for arrival, item in bag.inputs[start:stop]:
+            if isinstance(item, Measured):
+                observer.add_joint_state(item)
                 continue
-            observer.add_image(each.camera, np.array(now), each.taken)
-            at = observer.due(last, nominal)
-            if at is None or observer.newest is None or not segment.start <= at <= segment.end - period:
+            observer.add_image(item.camera, np.array(arrival), item.taken)
+            time = observer.due(last, nominal)
+            if time is None or observer.newest is None or not segment.start <= time <= segment.end - period:
                 continue
-            measured = observer.measured_at(at)
-            if abs(measured.at - at) <= MEASURED_WITHIN:
-                longest = max(longest, at - last if steps else 0.0)
+            joint_state = observer.measured_at(time)
+            if abs(joint_state.at - time) <= MEASURED_WITHIN:
+                longest = max(longest, time - last if steps else 0.0)
                 # Early images must not make all later steps early, too.
-                last, nominal = at, (at if at - nominal > period / 2 else nominal) + period
+                last, nominal = time, (time if time - nominal > period / 2 else nominal) + period
                 arrivals = {camera: float(image) for camera, image in observer.images.items()}
-                steps.append(_Step(at, arrivals, observer.state(measured)))
+                steps.append(_Step(time, arrivals, observer.state(joint_state)))
         if not steps:
             raise UserError(f"{bag.folder} has no matching images of {', '.join(self.spec.cameras)} in {segment}")
         if longest > LATE * period:
-            why = "images or joint states are missing, or do not match"
-            log.warning("%s: no step for up to %.2f s in %s: %s", bag.folder, longest, segment, why)
+            reason = "images or joint states are missing, or do not match"
+            log.warning("%s: no step for up to %.2f s in %s: %s", bag.folder, longest, segment, reason)
         return steps
 
     def _images(self, bag: _Bag, steps: Sequence[_Step]) -> dict[tuple[str, float], Array]:
         """Return camera and arrival [s] → image (H, W, 3)."""
-        wanted = {place for step in steps for place in step.arrivals.items()}
-        first, last = (choose(at for _, at in wanted) for choose in (min, max))
+        keys = {key for step in steps for key in step.arrivals.items()}
+        first, last = (choose(arrival for _, arrival in keys) for choose in (min, max))
         images = dict[tuple[str, float], Array]()
         with opened(bag.folder) as reader:
             start = reader.start_time
             span = start + round(first * 1e9), start + round(last * 1e9) + 1
             for topic, stamp, message in messages_of(reader, self._cameras, bag.folder, *span):
-                if (place := (self._cameras[topic], (stamp - start) * 1e-9)) in wanted:
+                if (key := (self._cameras[topic], (stamp - start) * 1e-9)) in keys:
                     with bag_errors(bag.folder):
-                        images[place] = resize(messages.image_from(message), self.spec.image_size)
+                        images[key] = resize(messages.image_from(message), self.spec.image_size)
         return images
 
     def _action(self, bag: _Bag, segment: _Segment, at: float) -> Array:
         """Return the (D,) motion from `at` over one control period."""
         end, joints = at + 1 / self.spec.control_hz, len(self._limits.joints)
         track = bag.commands if _covers(bag.commands, at) and _covers(bag.commands, end) else bag.measured
-        motion = self._controller.motion_between(*(_between(track, when)[:joints] for when in (at, end)))
+        motion = self._controller.motion_between(*(_interpolate(track, time)[:joints] for time in (at, end)))
         if self._gripper is None:
             return motion
-        told = bag.openings[: bisect_right(bag.openings, end, key=WHEN)][-1:]
-        if told and told[0][0] >= segment.start:  # an earlier command was the policy's, not the person's
-            return np.insert(motion, self._gripper, told[0][1])
-        return np.insert(motion, self._gripper, _between(bag.measured, end)[joints] / self._limits.stroke)
+        openings = bag.openings[: bisect_right(bag.openings, end, key=WHEN)][-1:]
+        if openings and openings[0][0] >= segment.start:  # an earlier command was the policy's, not the person's
+            return np.insert(motion, self._gripper, openings[0][1])
+        return np.insert(motion, self._gripper, _interpolate(bag.measured, end)[joints] / self._limits.stroke)
 
 
 def _covers(track: Track, at: float) -> bool:
@@ -343,28 +343,28 @@ def _covers(track: Track, at: float) -> bool:
     return 0 < place < len(track) and track[place][0] - track[place - 1][0] <= GAP
 
 
-def _between(track: Track, at: float) -> Array:
+def _interpolate(track: Track, at: float) -> Array:
     """Interpolate linearly."""
-    after = min(bisect_left(track, at, key=WHEN), len(track) - 1)
-    (begin, start), (end, stop) = track[max(after - 1, 0)], track[after]
+    index = min(bisect_left(track, at, key=WHEN), len(track) - 1)
+    (begin, start), (end, stop) = track[max(index - 1, 0)], track[index]
     return start + min(max((at - begin) / max(end - begin, 1e-9), 0.0), 1.0) * (stop - start)
 
 
 def _read_bags(folder: Path | str | None, topics: Topics, limits: JointLimits) -> list[_Bag]:
     if folder is None:
         raise UserError("expert=bag needs a bag: name its folder with expert=bag expert.folder=DIR")
-    inside = sorted(path.parent for path in Path(folder).glob(f"*/{DESCRIPTION}"))
-    return [_Bag(each, topics, limits) for each in inside or [Path(folder)]]
+    folders = sorted(path.parent for path in Path(folder).glob(f"*/{DESCRIPTION}"))
+    return [_Bag(path, topics, limits) for path in folders or [Path(folder)]]
 
 
 def _segments(bags: Sequence[_Bag], cameras: Sequence[str]) -> list[tuple[_Bag, _Segment]]:
     """Return the segments that are episodes: those with images of all cameras; raise a UserError if there are none."""
-    found = []
-    for bag, segment in ((each, segment) for each in bags for segment in each.segments()):
-        if blind := [camera for camera in cameras if not bag.sees(camera, segment)]:
-            log.warning("%s: no image of %s in %s, which is left out", bag.folder, ", ".join(blind), segment)
+    segments = []
+    for bag, segment in ((source, segment) for source in bags for segment in source.segments()):
+        if unseen_cameras := [camera for camera in cameras if not bag.sees(camera, segment)]:
+            log.warning("%s: no image of %s in %s, which is left out", bag.folder, ", ".join(unseen_cameras), segment)
         else:
-            found.append((bag, segment))
-    if found:
-        return found
+            segments.append((bag, segment))
+    if segments:
+        return segments
     raise UserError(f"{bags[0].folder} has no instruction that was followed with images of {', '.join(cameras)}")

@@ -33,22 +33,22 @@ class Keys:
         if not isinstance(message, Mapping):
             raise UserError(f"an observation must be a map, got {type(message).__name__}")
         cameras = self.cameras(spec)
-        wanted = [*cameras.values(), *self.state, self.prompt]
-        found = {key: _find(message, key) for key in wanted}
-        if missing := [key for key, value in found.items() if value is None]:
-            present = ", ".join(str(key)[:50] for key in list(message)[:20])
-            raise UserError(f"the observation lacks {', '.join(missing)}: it has {present or 'nothing'}")
-        images = {camera: _image(key, found[key]) for camera, key in cameras.items()}
+        keys = [*cameras.values(), *self.state, self.prompt]
+        values = {key: _find(message, key) for key in keys}
+        if missing_keys := [key for key, value in values.items() if value is None]:
+            names = ", ".join(str(key)[:50] for key in list(message)[:20])
+            raise UserError(f"the observation lacks {', '.join(missing_keys)}: it has {names or 'nothing'}")
+        images = {camera: _image(key, values[key]) for camera, key in cameras.items()}
         for camera, image in images.items():
             spec.require_cut(camera, image.shape, cameras[camera])
-        state = np.concatenate([_vector(key, found[key]) for key in self.state])
+        state = np.concatenate([_vector(key, values[key]) for key in self.state])
         if len(state) != len(spec.state):
             raise UserError(
                 f"the state in {' and '.join(self.state)} has {len(state)} numbers, "
                 f"the policy needs {len(spec.state)}: {', '.join(spec.state)}"
             )
-        said = instruction(self.prompt, found[self.prompt])
-        return Observation(images, state, said, running=_running(message.get("running"), spec))
+        prompt = instruction(self.prompt, values[self.prompt])
+        return Observation(images, state, prompt, running=_running(message.get("running"), spec))
 
 
 def _find(message: Mapping[Any, Any], key: str) -> Any:
@@ -79,13 +79,13 @@ def _image(key: str, value: Any) -> Array:
 def _vector(key: str, value: Any) -> Array:
     """Return numbers as (N,) float32."""
     try:
-        given = np.asarray(value).reshape(-1)
-        if given.dtype.kind not in "biuf":
-            raise ValueError(given.dtype)
+        array = np.asarray(value).reshape(-1)
+        if array.dtype.kind not in "biuf":
+            raise ValueError(array.dtype)
     except ValueError as error:  # also rows of different lengths
         raise UserError(f"{key} is not a vector of numbers") from error
     with np.errstate(over="ignore"):
-        vector = given.astype(np.float32)
+        vector = array.astype(np.float32)
     if not np.isfinite(vector).all():
         raise UserError(f"{key} holds a number that is not finite")
     return vector
@@ -95,8 +95,8 @@ def _running(value: Any, spec: Spec) -> Running | None:
     """Return the rest of the plan that a client executes."""
     if value is None:
         return None
-    said, width = value if isinstance(value, Mapping) else {}, len(spec.action)
-    actions, delay = said.get("actions"), said.get("delay")
+    plan, width = value if isinstance(value, Mapping) else {}, len(spec.action)
+    actions, delay = plan.get("actions"), plan.get("delay")
     if not isinstance(actions, np.ndarray) or actions.ndim != 2 or actions.shape[1] != width or not len(actions):
         raise UserError(f"running/actions must be a plan (n, {width}), got {getattr(actions, 'shape', None)}")
     if type(delay) is not int or not 0 <= delay <= len(actions):

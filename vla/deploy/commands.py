@@ -43,8 +43,8 @@ class ArmOutput:
     def publish(self, command: Command, now: float) -> None:
         """Pass a command of the loop on."""
         for sender in self.senders:
-            if (ahead := self._loop.motion.commit(command, now)) is not None:
-                sender.send(sender.kind.Goal(trajectory=trajectory(self._loop.limits, ahead, self._loop.tick)))
+            if (commands := self._loop.motion.commit(command, now)) is not None:
+                sender.send(sender.kind.Goal(trajectory=trajectory(self._loop.limits, commands, self._loop.tick)))
         self.publisher.publish(self._message(command, now))
 
     def _joint_state(self, command: Command, now: float) -> JointState:
@@ -85,31 +85,31 @@ class GripperOutput:
 
     def reset(self) -> None:
         """Forget the last goal, so that the next one is sent even if it is equal."""
-        self._wanted: bool | None = None  # open?
-        self._sent: bool | None = None
+        self._target_open: bool | None = None  # open?
+        self._sent_open: bool | None = None
 
     def publish(self, command: Command) -> None:
         """Pass the opening of a command on, if it has one."""
         if fingers := finger_positions(self._loop.limits, command):
             self._publisher.publish(Float64MultiArray(data=fingers))
         if not self._loop.acting:
-            self._wanted = None  # drops a goal that waits for the cancellation of the previous one
+            self._target_open = None  # drops a goal that waits for the cancellation of the previous one
         elif command.opening is not None:
             if not CLOSE_BELOW <= command.opening <= OPEN_ABOVE:
-                self._wanted = command.opening > OPEN_ABOVE
+                self._target_open = command.opening > OPEN_ABOVE
             self._advance()
 
     def _advance(self) -> None:
         """Send the requested goal once the previous one has ended: Franka's gripper accepts one at a time."""
-        if not self._goals or self._wanted is None or self._wanted == self._sent:
+        if not self._goals or self._target_open is None or self._target_open == self._sent_open:
             return
-        busy = [sender for sender in self.senders if sender.active]
-        for sender in busy:
+        busy_senders = [sender for sender in self.senders if sender.active]
+        for sender in busy_senders:
             sender.cancel()
-            self._sent = None
-        if not busy:
-            sender, goal = self._goals[self._wanted]
-            self._sent = self._wanted
+            self._sent_open = None
+        if not busy_senders:
+            sender, goal = self._goals[self._target_open]
+            self._sent_open = self._target_open
             sender.send(goal)
 
 

@@ -26,7 +26,7 @@ STILL, STILL_FOR = 0.005, 0.2  # an arm that has moved less [rad] for so long [s
 
 
 @dataclass
-class _Pending:
+class _Request:
     """An inference under way."""
 
     since: float
@@ -74,7 +74,7 @@ class ControlLoop:
         self.obstacle = ""  # external reason to hold the arm until this is empty again
         self.motion = Motion(self.limits, self.tick, 1 / self.spec.control_hz, self.goals.workspace)
         self._observer, self._tracking = Observer(self.spec), Tracking(self.safety, self._follows_positions)
-        self._pending: _Pending | None = None
+        self._request: _Request | None = None
         self._planned = np.empty((0, len(self.spec.action)), np.float32)  # the actions in the schedule
         self.delays = Delays(1 / self.spec.control_hz)  # from observations to their plans
         self.observed_at = -np.inf  # time stamp of the last observation
@@ -101,9 +101,9 @@ class ControlLoop:
         if not instruction:
             self.stop("the instruction is empty")
             return False
-        repeated = instruction == self.instruction and now - self._said_at < REPEATED
+        is_repetition = instruction == self.instruction and now - self._said_at < REPEATED
         self._said_at = now
-        if not repeated:
+        if not is_repetition:
             self.instruction, self._instructed_at = instruction, now
             self._drop_plans()
             if self.state is State.STOPPED and self._timed_out:
@@ -126,19 +126,19 @@ class ControlLoop:
 
     def hand_over(self) -> None:
         """Leave the arm, which must be at rest, to a person; nothing is commanded from now on."""
-        self.handed_over, self._pending = True, None
+        self.handed_over, self._request = True, None
         if self.state not in (State.STOPPED, State.FAULT):
             self._wait_to_run("")
 
     def take_back(self, now: float) -> None:
         """Command the arm again, from its measured pose; the gripper stays as it is until the policy moves it. Raises a
         UserError if the arm moves, is outside its limits, or has no recent joint state; the person then keeps it."""
-        measured = self._observer.newest
-        if (old := self._joints_problem(now)) or measured is None:
-            raise UserError(old)
+        joint_state = self._observer.newest
+        if (problem := self._joints_problem(now)) or joint_state is None:
+            raise UserError(problem)
         if self._observer.moved(STILL_FOR) > STILL:
             raise UserError("the arm still moves: let it rest first")
-        self.motion.start(measured.joints, None, now)
+        self.motion.start(joint_state.joints, None, now)
         self._tracking = Tracking(self.safety, self._follows_positions)
         self.handed_over, self._instructed_at = False, now
         if self.state is State.HANDED_OVER:
@@ -153,35 +153,35 @@ class ControlLoop:
         if self.state in (State.WAITING, State.RUNNING, State.HOLDING):
             self._set_state(State.HOLDING, reason)
 
-    def _wait_to_run(self, why: str) -> None:
+    def _wait_to_run(self, reason: str) -> None:
         """Enter HANDED_OVER while a person moves the arm, otherwise HOLDING until the images are fresh."""
         if self.handed_over:
             self._set_state(State.HANDED_OVER, f"a person moves the arm; to continue: {HAND_BACK}")
         else:
-            self._set_state(State.HOLDING, f"{why}, waiting for fresh images")
+            self._set_state(State.HOLDING, f"{reason}, waiting for fresh images")
 
     def next_observation(self, now: float) -> Observation | None:
         """Return the observation for the policy if an inference is due; then call `set_plan` or `reject_plan`."""
         schedule = self.motion.schedule
-        observed = self._observer.due(
+        image_time = self._observer.due(
             self._last_observed, schedule.end if self._execute is None else schedule.executed(self._execute)
         )
-        if self.state is not State.RUNNING or self._pending is not None or observed is None:
+        if self.state is not State.RUNNING or self._request is not None or image_time is None:
             return None
         if schedule.newest and now > schedule.end + 0.5 / self.spec.control_hz:
             self.late_plans += 1
         # Anchor on the pose commanded at that time. The measured pose lags behind it; the last goal runs ahead of an
         # arm that its limits slow down, and the policy would overshoot.
-        anchor = self.motion.commanded_at(observed)
+        anchor = self.motion.commanded_at(image_time)
         if not self._follows_positions:
-            anchor = self._observer.measured_at(observed).joints
-        self.resumed, self._last_observed, self.observed_at = np.isinf(self._last_observed), observed, observed
-        self._pending = _Pending(now, observed, anchor)
-        observation = self._observer.observation(observed, self.instruction)
-        rest = len(schedule.remaining(observed + 0.5 / self.spec.control_hz))  # an image may be early
-        if self._execute is None or not rest:
+            anchor = self._observer.measured_at(image_time).joints
+        self.resumed, self._last_observed, self.observed_at = np.isinf(self._last_observed), image_time, image_time
+        self._request = _Request(now, image_time, anchor)
+        observation = self._observer.observation(image_time, self.instruction)
+        steps_left = len(schedule.remaining(image_time + 0.5 / self.spec.control_hz))  # an image may be early
+        if self._execute is None or not steps_left:
             return observation
-        return replace(observation, running=Running(self._planned[-rest:], min(self.delays.longest, rest)))
+        return replace(observation, running=Running(self._planned[-steps_left:], min(self.delays.longest, steps_left)))
 
     def set_plan(self, actions: Array) -> bool:
         """Schedule the policy's actions (k, D); the first one starts at the time of the observation.
@@ -190,25 +190,25 @@ class ControlLoop:
 
         Actions in the past are skipped, but still count towards the goals of later Cartesian ones.
         """
-        pending, self._pending = self._pending, None
-        if pending is None:  # the arm has been handed over in the meantime
+        request, self._request = self._request, None
+        if request is None:  # the arm has been handed over in the meantime
             return False
         try:
-            waypoints = self.goals.of(actions, pending.observed, pending.anchor)
+            waypoints = self.goals.of(actions, request.observed, request.anchor)
         except UserError as error:
             self._count_rejection(str(error))
             return False
-        if follows := self.state is State.RUNNING and not pending.outdated:
+        if follows := self.state is State.RUNNING and not request.outdated:
             self.rejections, self._planned = 0, actions
             # An arm that does not follow its commands is where it is measured, not where it was commanded.
-            measured = None if self._follows_positions else self._observer.newest
-            self.motion.follow(waypoints, None if measured is None else measured.joints)
+            joint_state = None if self._follows_positions else self._observer.newest
+            self.motion.follow(waypoints, None if joint_state is None else joint_state.joints)
         return follows
 
     def reject_plan(self, reason: str) -> None:
         """Count a failed inference, unless the arm has been handed over since it began."""
-        if self._pending is not None:
-            self._pending = None
+        if self._request is not None:
+            self._request = None
             self._count_rejection(reason)
 
     def _count_rejection(self, reason: str) -> None:
@@ -232,17 +232,17 @@ class ControlLoop:
 
     def _supervise(self, now: float) -> None:
         """Change the state if an input is missing, late or invalid, or fresh again."""
-        newest = self._observer.newest
-        if newest is None:
+        joint_state = self._observer.newest
+        if joint_state is None:
             return
         if not self.motion.started and self.state is not State.FAULT:  # after which a person must inspect the arm
-            if old := self._joints_problem(now):  # the arm may be elsewhere by now
-                return None if self.state is State.STOPPED else self._set_state(self.state, old)
-            self._take_over(newest, now)
-        off_track, moved_unseen = self._tracking.check(self.motion, newest, now)
-        if moved_unseen or (off_track and self._held):
+            if problem := self._joints_problem(now):  # the arm may be elsewhere by now
+                return None if self.state is State.STOPPED else self._set_state(self.state, problem)
+            self._take_over(joint_state, now)
+        off_track, moved_unseen = self._tracking.check(self.motion, joint_state, now)
+        if moved_unseen or (off_track and self._must_stay):
             # The earlier commanded pose is dropped, because the arm would rush back to it.
-            self.motion.hold(newest.joints)
+            self.motion.hold(joint_state.joints)
             if self.state is not State.FAULT:
                 self.fail("the arm was moved while it was held")
         if self.state in (State.STOPPED, State.FAULT):
@@ -254,41 +254,41 @@ class ControlLoop:
         elif self.safety.instruction is not None and now - self._instructed_at > self.safety.instruction:
             self.stop(f"time-out: {self.safety.instruction:g} s on one instruction", "send the next instruction")
             self._timed_out = True
-        elif problem := self._input_problem(newest, now):
+        elif problem := self._input_problem(joint_state, now):
             # A held arm moves again only after consecutive fresh frames.
             self._observer.fresh = 0
             self._set_state(State.HOLDING if self.state is State.RUNNING else self.state, problem)
         elif self.state is State.WAITING or self._observer.fresh >= self.safety.fresh_frames:
             self._set_state(State.RUNNING, "")
 
-    def _take_over(self, measured: Measured, now: float) -> None:
+    def _take_over(self, state: Measured, now: float) -> None:
         """Make the measured pose the first commanded one."""
         try:
-            self.motion.start(measured.joints, float(np.clip(measured.opening / self.limits.stroke, 0.0, 1.0)), now)
+            self.motion.start(state.joints, float(np.clip(state.opening / self.limits.stroke, 0.0, 1.0)), now)
         except UserError as error:
             self.fail(str(error))
 
     @property
-    def _held(self) -> bool:
+    def _must_stay(self) -> bool:
         """Whether the arm is to stay where it is; after a fault it may still be on its way to rest."""
         resting = self.motion.limiter.resting and self._observer.moved(STILL_FOR) <= STILL
         return self.state is State.STOPPED or (self.state is State.FAULT and resting)
 
-    def _input_problem(self, newest: Measured, now: float) -> str:
+    def _input_problem(self, joint_state: Measured, now: float) -> str:
         """Describe which input or inference is overdue; empty if none is."""
         if problem := self.obstacle or self._observer.image_problem(now, self.safety.image_age):
             return problem
-        if old := self._joints_problem(now):
-            return old
-        if self._pending is not None and now - self._pending.since > self.safety.inference:
+        if problem := self._joints_problem(now):
+            return problem
+        if self._request is not None and now - self._request.since > self.safety.inference:
             return f"inference takes longer than {self.safety.inference} s"
         return ""
 
     def _joints_problem(self, now: float) -> str:
         """Say that the newest joint state is too old, or that there is none; empty if it is recent."""
-        newest = self._observer.newest
-        recent = newest is not None and now - newest.at <= self.safety.joints_age
-        return "" if recent else f"no joint state within the last {self.safety.joints_age} s"
+        joint_state = self._observer.newest
+        is_recent = joint_state is not None and now - joint_state.at <= self.safety.joints_age
+        return "" if is_recent else f"no joint state within the last {self.safety.joints_age} s"
 
     def _set_state(self, state: State, reason: str) -> None:
         if state is not self.state:
@@ -300,5 +300,5 @@ class ControlLoop:
     def _drop_plans(self) -> None:
         """Brake until the next plan, and ignore an inference under way, whose observation is outdated."""
         self.motion.follow([])
-        if self._pending is not None:
-            self._pending.outdated = True
+        if self._request is not None:
+            self._request.outdated = True

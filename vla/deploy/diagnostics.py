@@ -22,12 +22,12 @@ class Diagnostics:
     """Publishes ~/status and /diagnostics, and logs what changes."""
 
     def __init__(self, node: GuardedLifecycleNode, loop: ControlLoop, dry_run: bool) -> None:
-        self._node, self._loop, self._dry_run, self._dropped = node, loop, dry_run, 0
+        self._node, self._loop, self._dry_run, self._drop_count = node, loop, dry_run, 0
         self._status = node.add_publisher(DiagnosticStatus, "~/status", qos=RECENT)
         self._array = node.add_publisher(DiagnosticArray, "/diagnostics")
         self._latencies: dict[str, deque[float]] = {}
-        self._reported: tuple[State | None, str] = (None, "")
-        self._ignored = ""  # message about an instruction that is ignored after a stop or a fault
+        self._reported_state: tuple[State | None, str] = (None, "")
+        self._ignored_message = ""  # message about an instruction that is ignored after a stop or a fault
 
     def record(self, name: str, seconds: float) -> None:
         """Add a latency."""
@@ -35,26 +35,26 @@ class Diagnostics:
 
     def drop(self, reason: str) -> None:
         """Count a message that cannot be used."""
-        self._dropped += 1
+        self._drop_count += 1
         self._node.get_logger().warning(shorten(reason, MAX_MESSAGE), throttle_duration_sec=1.0)
 
     def ignore(self, message: str) -> None:
         """Report that an instruction is ignored, once until the state changes."""
-        if message != self._ignored:
-            self._ignored = message
+        if message != self._ignored_message:
+            self._ignored_message = message
             self._node.get_logger().warning(shorten(message, MAX_MESSAGE))
             self.report()
 
     def report_changes(self) -> None:
         """Report if state or reason have changed."""
-        if (self._loop.state, self._loop.reason) != self._reported:
+        if (self._loop.state, self._loop.reason) != self._reported_state:
             self.report()
 
     def report(self) -> None:
         """Publish the status, and log a changed state."""
         loop, level = self._loop, LEVELS.get(self._loop.state, DiagnosticStatus.OK)
-        if (loop.state, loop.reason) != self._reported:
-            self._reported, self._ignored = (loop.state, loop.reason), ""
+        if (loop.state, loop.reason) != self._reported_state:
+            self._reported_state, self._ignored_message = (loop.state, loop.reason), ""
             line = f"{loop.state}: {shorten(loop.reason, MAX_MESSAGE)}".removesuffix(": ")
             # Two calls, because rclpy refuses to log with changing severity from one line.
             if level == DiagnosticStatus.OK:
@@ -62,7 +62,7 @@ class Diagnostics:
             else:
                 self._node.get_logger().warning(line)
         pairs = [KeyValue(key=key, value=value) for key, value in self._values().items()]
-        text = shorten(self._ignored or loop.reason or loop.state.value, MAX_MESSAGE)
+        text = shorten(self._ignored_message or loop.reason or loop.state.value, MAX_MESSAGE)
         status = DiagnosticStatus(level=level, name=self._node.get_name(), message=text, values=pairs)
         self._status.publish(status)
         array = DiagnosticArray(status=[status])
@@ -75,7 +75,7 @@ class Diagnostics:
             "state": loop.state.value,
             HANDED_OVER: "yes" if loop.handed_over or self._dry_run else "no",
             "instruction": shorten(loop.instruction),
-            "messages dropped": str(self._dropped),
+            "messages dropped": str(self._drop_count),
             "late plans": str(loop.late_plans),
         }
         for name, seconds in self._latencies.items():

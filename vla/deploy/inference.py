@@ -45,8 +45,8 @@ class Inference:
         """Return actions (k, D) to execute, and the duration [s], of an inference that is done, or raise its error."""
         if self._running is None or not self._running.done():
             return None
-        done, self._running = self._running, None
-        return done.result()
+        future, self._running = self._running, None
+        return future.result()
 
     def forget(self) -> None:
         """Drop an inference under way; the next one waits for it."""
@@ -56,14 +56,14 @@ class Inference:
         """Wait for an inference under way, and end the thread."""
         self._pool.shutdown(cancel_futures=True)
 
-    def _plan(self, observation: Observation, first: bool) -> tuple[Array, float]:
-        began = time.monotonic()
-        if first:
+    def _plan(self, observation: Observation, is_first: bool) -> tuple[Array, float]:
+        start = time.monotonic()
+        if is_first:
             self._policy.reset(observation.instruction, next(self._episodes))
         plan = self._policy.plan(observation)
         # A plan that the next one continues is executed until that one arrives.
-        chosen = plan if getattr(self._policy, "chunking", None) else plan[: executed(self._policy)]
-        return chosen, time.monotonic() - began
+        actions = plan if getattr(self._policy, "chunking", None) else plan[: executed(self._policy)]
+        return actions, time.monotonic() - start
 
 
 def executed(policy: Policy) -> int:

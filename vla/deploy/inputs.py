@@ -40,8 +40,8 @@ class Inputs:
         topics = settings.topics
         best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # matches every publisher
         for camera in loop.spec.cameras:
-            remapped = node.resolve_topic_name(topics.images[camera])
-            kind = CompressedImage if remapped.endswith(COMPRESSED) else Image
+            topic_name = node.resolve_topic_name(topics.images[camera])
+            kind = CompressedImage if topic_name.endswith(COMPRESSED) else Image
             node.add_subscription(kind, topics.images[camera], partial(self._on_image, camera), best_effort)
         for topic in filter(None, {topics.joint_states, topics.finger_states}):
             node.add_subscription(JointState, topic, self._on_joint_state, best_effort)
@@ -82,25 +82,25 @@ class Inputs:
         if not self._node.active:
             return
         try:
-            of_arm = not {*message.name}.isdisjoint(self._loop.limits.joints)
-            age = self._age("arm" if of_arm else "fingers", message)
-            measured = self._joint_states.read(message, now - age)
+            has_arm = not {*message.name}.isdisjoint(self._loop.limits.joints)
+            age = self._age("arm" if has_arm else "fingers", message)
+            reading = self._joint_states.read(message, now - age)
         except UserError as error:
             return self._diagnostics.drop(f"joint states: {error}")
-        if measured is not None:
-            self._loop.on_joint_state(*measured, now - age)
+        if reading is not None:
+            self._loop.on_joint_state(*reading, now - age)
 
     def _on_instruction(self, message: String) -> None:
         if not self._node.active:
             return
-        said, loop = message.data.strip(), self._loop
-        quoted = repr(messages.shorten(message.data))
+        instruction, loop = message.data.strip(), self._loop
+        quotation = repr(messages.shorten(message.data))
         if (length := len(message.data)) > LONGEST_INSTRUCTION:
-            limit = f"an instruction of {length} characters, the limit is {LONGEST_INSTRUCTION}: {quoted}"
+            limit = f"an instruction of {length} characters, the limit is {LONGEST_INSTRUCTION}: {quotation}"
             return self._diagnostics.drop(limit)
-        repeated = said == loop.instruction
-        if loop.on_instruction(said, time.monotonic()):
-            if not repeated:
-                self._node.get_logger().info(f"instruction: {quoted}")
-        elif said:
-            self._diagnostics.ignore(f"instruction ignored while {loop.state}: {quoted}; {loop.reason}")
+        is_repetition = instruction == loop.instruction
+        if loop.on_instruction(instruction, time.monotonic()):
+            if not is_repetition:
+                self._node.get_logger().info(f"instruction: {quotation}")
+        elif instruction:
+            self._diagnostics.ignore(f"instruction ignored while {loop.state}: {quotation}; {loop.reason}")

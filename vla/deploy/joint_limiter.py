@@ -99,9 +99,9 @@ class JointLimiter:
     def start(self, measured: Array) -> None:
         """Start from the measured position (J,), at rest; raise a UserError if it is outside the limits."""
         low, high = self.limits.min_position, self.limits.max_position
-        out = (measured < low) | (measured > high)
-        if out.any():
-            joint = int(np.argmax(out))
+        violations = (measured < low) | (measured > high)
+        if violations.any():
+            joint = int(np.argmax(violations))
             raise UserError(
                 f"{self.limits.joints[joint]} is at {measured[joint]:.3f} rad, outside "
                 f"{low[joint]:.3f} to {high[joint]:.3f}: move it inside first"
@@ -115,12 +115,12 @@ class JointLimiter:
     def step(self, goal: Array, remaining: float = 0.0) -> Array:
         """Return the next command (J,) towards `goal` (J,), which is due in `remaining` seconds."""
         distance = np.clip(goal, self.limits.min_position, self.limits.max_position) - self.position
-        wanted = distance / max(remaining, self._period)
-        fastest = np.minimum(self._stoppable(np.abs(distance) + self.limits.overshoot), self.limits.max_speed)
+        velocity = distance / max(remaining, self._period)
+        limit = np.minimum(self._stopping_speed(np.abs(distance) + self.limits.overshoot), self.limits.max_speed)
         # Scale all joints alike, so that the tool stays on its path.
-        speed = np.abs(wanted)
-        share = np.min(np.divide(fastest, speed, out=np.ones_like(speed), where=speed > fastest))
-        return self._move(share * wanted)
+        speed = np.abs(velocity)
+        share = np.min(np.divide(limit, speed, out=np.ones_like(speed), where=speed > limit))
+        return self._move(share * velocity)
 
     def brake(self) -> Array:
         """Return the next command (J,) of the fastest stop."""
@@ -136,17 +136,17 @@ class JointLimiter:
         velocity = np.clip(velocity, -self.limits.max_speed, self.limits.max_speed)
         velocity = np.clip(velocity, self.velocity - change, self.velocity + change)
         # Keep the braking distance within the position limits.
-        up = self._stoppable(self.limits.max_position - self.position)
-        down = self._stoppable(self.position - self.limits.min_position)
-        velocity = np.clip(velocity, -down, up)
+        speed_up = self._stopping_speed(self.limits.max_position - self.position)
+        speed_down = self._stopping_speed(self.position - self.limits.min_position)
+        velocity = np.clip(velocity, -speed_down, speed_up)
         self.velocity = np.where(np.abs(velocity) < REST, 0.0, velocity)
         self.position = self.position + self.velocity * self._period
         return self.position.copy()
 
-    def _stoppable(self, distance: Array) -> Array:
+    def _stopping_speed(self, distance: Array) -> Array:
         """(J,) largest speed from which constant deceleration stops within `distance` (J,), this step included."""
         change = self.limits.max_acceleration * self._period
         unit = change * self._period  # distance by which each further step of braking is longer
         steps = np.maximum(distance, 0.0) / unit
-        whole = np.floor((np.sqrt(1 + 8 * steps) - 1) / 2)  # n steps cover n(n + 1)/2 of these
-        return change * (whole + (steps - whole * (whole + 1) / 2) / (whole + 1))
+        whole_steps = np.floor((np.sqrt(1 + 8 * steps) - 1) / 2)  # n steps cover n(n + 1)/2 of these
+        return change * (whole_steps + (steps - whole_steps * (whole_steps + 1) / 2) / (whole_steps + 1))

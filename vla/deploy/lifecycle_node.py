@@ -30,8 +30,8 @@ def transition(do: Callable[[Any, LifecycleState], Any]) -> Callable[[Any, Lifec
         try:
             do(node, state)
         except Exception as error:
-            why = error if isinstance(error, UserError) else traceback.format_exc()
-            node.get_logger().error(f"cannot {do.__name__.removeprefix('on_')}: {why}")
+            reason = error if isinstance(error, UserError) else traceback.format_exc()
+            node.get_logger().error(f"cannot {do.__name__.removeprefix('on_')}: {reason}")
             return FAILURE
         return SUCCESS
 
@@ -93,14 +93,14 @@ class GuardedLifecycleNode(LifecycleNode):
 
     def _LifecycleNodeMixin__on_change_state(self, request: Any, response: Any) -> Any:
         """Refuse a transition that is not available in this state (ros2/rclpy#1209)."""
-        available = {each[0]: each[1] for each in self._state_machine.available_transitions}
-        label, wanted = request.transition.label, request.transition.id
+        labels = {entry[0]: entry[1] for entry in self._state_machine.available_transitions}
+        label, transition_id = request.transition.label, request.transition.id
         if label:
-            wanted = next((key for key, name in available.items() if name == label), None)
-        if wanted in available:
+            transition_id = next((key for key, name in labels.items() if name == label), None)
+        if transition_id in labels:
             return super()._LifecycleNodeMixin__on_change_state(request, response)  # type: ignore[misc]
         self.get_logger().error(
-            f"transition {label or wanted} is not available, expected one of {', '.join(available.values())}"
+            f"transition {label or transition_id} is not available, expected one of {', '.join(labels.values())}"
         )
         response.success = False
         return response

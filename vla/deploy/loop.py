@@ -91,16 +91,16 @@ class Loop:
         for process in processes:
             process.start()
         try:
-            with ros(agent.network, self.output) as stopped, ExitStack() as opened:
+            with ros(agent.network, self.output) as stop_event, ExitStack() as stack:
                 from rclpy import create_node
 
                 from vla.deploy.operator import DemoOperator
 
                 node = create_node("vla_operator")
-                opened.callback(node.destroy_node)
-                operator = DemoOperator(node, agent.topics.instruction, stopped, *processes)
+                stack.callback(node.destroy_node)
+                operator = DemoOperator(node, agent.topics.instruction, stop_event, *processes)
                 # Recorded to the end, because a failed episode is the one to inspect.
-                opened.enter_context(closing(BagRecorder(node, self.output / "bag")))
+                stack.enter_context(closing(BagRecorder(node, self.output / "bag")))
                 yield operator
         finally:
             for process in processes:
@@ -110,9 +110,9 @@ class Loop:
                 process.kill()
 
 
-def _run(node: PolicyDeployment | SimulatorDeployment, given: list[str]) -> None:
+def _run(node: PolicyDeployment | SimulatorDeployment, arguments: list[str]) -> None:
     """Run a node in its own process, with arguments of ROS; user errors exit with one sentence."""
-    ros_arguments[:] = given
+    ros_arguments[:] = arguments
     leave_with_parent()
     without_triton()
     with plain_errors():

@@ -106,8 +106,8 @@ class JointStates:
             at: when it was captured [s].
         """
         arm, fingers, names = self._limits.joints, self._limits.fingers, {*message.name}
-        of_gripper = names >= {*fingers} and names.isdisjoint(arm)  # which may have further joints
-        if fingers and of_gripper and len(names) < len(fingers) + len(arm):
+        fingers_only = names >= {*fingers} and names.isdisjoint(arm)  # which may have further joints
+        if fingers and fingers_only and len(names) < len(fingers) + len(arm):
             self._fingers = (at, float(_positions(message, fingers)[0].sum()))
             return None
         if at - self._fingers[0] <= FINGERS_AGE and names.isdisjoint(fingers):
@@ -117,8 +117,8 @@ class JointStates:
             position, velocity = _positions(message, [*arm, *fingers])
             opening = float(position[len(arm) :].sum())
         place, low, high = position[: len(arm)], np.array(self._limits.low), np.array(self._limits.high)
-        if (beyond := (place < low - BEYOND) | (place > high + BEYOND)).any():
-            joint = int(np.argmax(beyond))
+        if (violations := (place < low - BEYOND) | (place > high + BEYOND)).any():
+            joint = int(np.argmax(violations))
             raise UserError(f"joint state has {arm[joint]} at {place[joint]:g} rad, where this arm cannot be")
         return place, velocity[: len(arm)], opening
 
@@ -126,9 +126,9 @@ class JointStates:
 def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
     """Read positions and velocities of some joints, by name."""
     names = list(message.name)
-    if missing := [name for name in joints if names.count(name) != 1]:
+    if missing_joints := [name for name in joints if names.count(name) != 1]:
         raise UserError(
-            f"joint state lacks {', '.join(missing)}, or has it twice; it has {', '.join(names) or 'nothing'}"
+            f"joint state lacks {', '.join(missing_joints)}, or has it twice; it has {', '.join(names) or 'nothing'}"
         )
     if len(message.position) != len(names) or len(message.velocity) not in (0, len(names)):
         raise UserError(
@@ -147,9 +147,9 @@ def command_from(names: Sequence[str], positions: Any, limits: JointLimits) -> t
     """Return target positions (J,) [rad] and opening 0 … 1, or None without fingers, of a command, by name. Raises a
     UserError if a joint is missing, the lengths differ, or a number is not finite."""
     names, positions = list(names), np.array(positions, dtype=float)
-    missing = [name for name in limits.joints if name not in names]
-    if missing or len(names) != len(positions) or not np.isfinite(positions).all():
-        problem = f"lacks {', '.join(missing)}" if missing else "needs one finite position per name"
+    missing_joints = [name for name in limits.joints if name not in names]
+    if missing_joints or len(names) != len(positions) or not np.isfinite(positions).all():
+        problem = f"lacks {', '.join(missing_joints)}" if missing_joints else "needs one finite position per name"
         raise UserError(f"joint command {problem}")
     fingers = [positions[names.index(name)] for name in limits.fingers if name in names]
     opening = float(np.mean(fingers)) / limits.finger_travel if fingers else None

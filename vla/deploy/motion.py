@@ -50,15 +50,15 @@ class _Workspace:
 
         A tool that is outside may come back, but not move further away.
         """
-        ahead = copy.copy(limiter)
-        ahead.step(goal, remaining)
-        position, velocity = ahead.position, ahead.velocity
+        trial = copy.copy(limiter)
+        trial.step(goal, remaining)
+        position, velocity = trial.position, trial.velocity
         farthest = max(LEEWAY, self._outside(limiter.position))
-        while self._outside(ahead.position) <= farthest:
-            if ahead.resting:
+        while self._outside(trial.position) <= farthest:
+            if trial.resting:
                 limiter.position, limiter.velocity = position, velocity
                 return
-            ahead.brake()
+            trial.brake()
         limiter.brake()
 
     def _outside(self, joints: Array) -> float:
@@ -81,10 +81,10 @@ class Goals:
             raise UserError(
                 f"the policy has {len(model.joints)} joints, the robot {len(limits.joints)}: use another deploy/robot"
             )
-        for ours, theirs in zip(model.joints, limits.joints, strict=True):
-            if ours != theirs and ours in limits.joints:
+        for name, robot_name in zip(model.joints, limits.joints, strict=True):
+            if name != robot_name and name in limits.joints:
                 raise UserError(
-                    f"the policy has {ours} where deploy.robot.joints has {theirs}: list joints and limits of the "
+                    f"the policy has {name} where deploy.robot.joints has {robot_name}: list joints and limits of the "
                     f"robot in the policy's order, {', '.join(model.joints)}"
                 )
         if model.gripper in spec.state and not limits.fingers:
@@ -130,7 +130,7 @@ class Motion:
         self._commanded: deque[tuple[float, Array]] = deque()  # at, joints
         # Trajectory that an arm executes by itself: since when, the state before it and its commands, and whether it is
         # still to be followed.
-        self._sent: tuple[float, list[Command]] | None = None
+        self._sent_trajectory: tuple[float, list[Command]] | None = None
         self._sent_valid = False
 
     @property
@@ -141,19 +141,19 @@ class Motion:
     def start(self, measured: Array, opening: float | None, now: float) -> None:
         """Take an arm over at its measured joints (J,), at rest; raise a UserError if it is outside its limits."""
         self.limiter.start(measured)
-        self._opening, self._sent, self._sent_valid = opening, None, False
+        self._opening, self._sent_trajectory, self._sent_valid = opening, None, False
         self._commanded.clear()
         self._record(now)
 
     def hold(self, measured: Array) -> None:
         """Command the measured joints (J,), so that an arm that is elsewhere is not pulled back."""
         self.limiter.hold(measured)
-        self._sent, self._sent_valid = None, False
+        self._sent_trajectory, self._sent_valid = None, False
 
     def follow(self, plan: list[Waypoint], position: Array | None = None) -> None:
         """Replace the plan; its first goal is approached from the commanded position, or from `position` (J,)."""
         if position is not None:
-            self.limiter.position, self._sent = np.array(position, float), None
+            self.limiter.position, self._sent_trajectory = np.array(position, float), None
         self.schedule, self._sent_valid = Schedule[Waypoint](self._period), False
         if plan:
             self.schedule.add(plan, plan[0][0] - self._period)
@@ -164,10 +164,10 @@ class Motion:
 
     def advance(self, now: float) -> Command:
         """Return the command of this tick."""
-        if self._sent is not None:
-            self._recall(*self._sent, now)
+        if self._sent_trajectory is not None:
+            self._recall(*self._sent_trajectory, now)
         if not self._sent_valid:
-            self._before = _command(self.limiter, self._opening)
+            self._last_command = _command(self.limiter, self._opening)
             self._opening = self._step(self.limiter, now, self._opening)
         self._record(now)
         return _command(self.limiter, self._opening)
@@ -180,8 +180,8 @@ class Motion:
             longest: time [s] after which the arm brakes, if the schedule has not ended before.
         """
         limiter, opening = copy.copy(self.limiter), self._opening
-        commands, until = [], min(now + longest, self.schedule.end)
-        while now < until:
+        commands, end = [], min(now + longest, self.schedule.end)
+        while now < end:
             now += self.tick
             opening = self._step(limiter, now, opening)
             commands.append(_command(limiter, opening))
@@ -197,18 +197,18 @@ class Motion:
         """
         if self._sent_valid:
             return None
-        ahead = self.ahead(command, now)
+        trajectory = self.ahead(command, now)
         self._sent_valid = True
-        return ahead
+        return trajectory
 
     def ahead(self, command: Command, now: float, longest: float = math.inf) -> list[Command]:
         """Return the trajectory from this command to rest, which the arm follows until it is sent another one.
 
         The next command continues from where the arm is on it by then, even if that tick is late. Args: as `horizon`.
         """
-        ahead = [command, *self.horizon(now, longest)]
-        self._sent = now, [self._before, *ahead]
-        return ahead
+        trajectory = [command, *self.horizon(now, longest)]
+        self._sent_trajectory = now, [self._last_command, *trajectory]
+        return trajectory
 
     def _recall(self, since: float, ahead: list[Command], now: float) -> None:
         """Set the commanded state from the trajectory `ahead`, sent at `since`: the arm follows that anyway.
@@ -216,10 +216,10 @@ class Motion:
         It is the state of this tick while the trajectory is valid, else of the previous one, because a step follows.
         """
         ticks = min(max(round((now - since) / self.tick, 6) + self._sent_valid, 0.0), len(ahead) - 1.0)
-        before, after, share = ahead[math.floor(ticks)], ahead[math.ceil(ticks)], ticks % 1
-        self.limiter.position = before.position + share * (after.position - before.position)
-        self.limiter.velocity = after.velocity.copy()  # with which a command is approached
-        self._opening = before.opening
+        start, end, share = ahead[math.floor(ticks)], ahead[math.ceil(ticks)], ticks % 1
+        self.limiter.position = start.position + share * (end.position - start.position)
+        self.limiter.velocity = end.velocity.copy()  # with which a command is approached
+        self._opening = start.opening
 
     def _step(self, limiter: JointLimiter, now: float, opening: float | None) -> float | None:
         """Move towards the next goal within limits and workspace, or brake; returns the opening to command."""

@@ -42,14 +42,14 @@ class Observer:
             UserError: the spec has no robot, or its state has more than joint states contain.
         """
         self._spec, self._model = spec, spec.require_robot("deployment")
-        if others := [name for name in spec.state if name not in self._model.components]:
-            raise UserError(f"the policy's state has {', '.join(others)}, which joint states do not contain")
+        if extra_names := [name for name in spec.state if name not in self._model.components]:
+            raise UserError(f"the policy's state has {', '.join(extra_names)}, which joint states do not contain")
         self._factors = np.array([UNITS.get(unit.removesuffix("/s"), 1.0) for unit in spec.state_units])
         self.fresh = 0  # matching sets since the last reset to 0, each with a newer image of every camera
         self._newest: dict[str, tuple[float, Array]] = {}  # camera → time stamp and image
-        self._counted: dict[str, float] = {}  # camera → time stamp of its image in the last counted set
+        self._counted_stamps: dict[str, float] = {}  # camera → time stamp of its image in the last counted set
         self._matched_at = -np.inf  # newest time stamp in the last matching set
-        self._measured: deque[Measured] = deque()
+        self._joint_states: deque[Measured] = deque()
 
     def add_image(self, camera: str, image: Array, at: float) -> None:
         """Add an image (H, W, 3) uint8 that was taken at `at`."""
@@ -58,19 +58,19 @@ class Observer:
             return
         times = {name: self._newest[name][0] for name in self._spec.cameras}
         self._matched_at = max(times.values())
-        if all(taken > self._counted.get(name, -np.inf) for name, taken in times.items()):
-            self.fresh, self._counted = self.fresh + 1, times
+        if all(time > self._counted_stamps.get(name, -np.inf) for name, time in times.items()):
+            self.fresh, self._counted_stamps = self.fresh + 1, times
 
     def add_joint_state(self, measured: Measured) -> None:
         """Add a joint state."""
-        self._measured.append(measured)
-        while self._measured[0].at < measured.at - HISTORY:
-            self._measured.popleft()
+        self._joint_states.append(measured)
+        while self._joint_states[0].at < measured.at - HISTORY:
+            self._joint_states.popleft()
 
     @property
     def newest(self) -> Measured | None:
         """The newest joint state."""
-        return self._measured[-1] if self._measured else None
+        return self._joint_states[-1] if self._joint_states else None
 
     @property
     def taken_at(self) -> float | None:
@@ -98,17 +98,17 @@ class Observer:
 
     def moved(self, seconds: float) -> float:
         """Return how far a joint has moved within the last `seconds` of the history [rad]."""
-        recent = [each.joints for each in self._measured if each.at >= self._measured[-1].at - seconds]
-        return float(np.ptp(recent, axis=0).max()) if recent else 0.0
+        positions = [state.joints for state in self._joint_states if state.at >= self._joint_states[-1].at - seconds]
+        return float(np.ptp(positions, axis=0).max()) if positions else 0.0
 
     def due(self, after: float, earliest: float) -> float | None:
         """Return when the newest images were taken; None unless they match, after `after`, about from `earliest` on."""
-        taken, early = self.taken_at, EARLY_SHARE / self._spec.control_hz
-        return None if taken is None or taken <= after or taken < earliest - early else taken
+        time, slack = self.taken_at, EARLY_SHARE / self._spec.control_hz
+        return None if time is None or time <= after or time < earliest - slack else time
 
     def measured_at(self, at: float) -> Measured:
         """Return the joint state nearest to `at` in the history."""
-        return min(self._measured, key=lambda measured: abs(measured.at - at))
+        return min(self._joint_states, key=lambda state: abs(state.at - at))
 
     def observation(self, at: float, instruction: str) -> Observation:
         """Return the newest images, taken at `at`, with the joint state of that time."""

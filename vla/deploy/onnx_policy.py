@@ -94,10 +94,10 @@ def write_programs(policy: Policy, folder: Path) -> None:
         draft.mkdir(parents=True)
         for part, steps in example_inputs(policy).items():
             program, path = Program(policy.model, part), draft / f"{part}.onnx"
-            captured, names = capture(program, steps[0]), list(steps[0])
-            exact = torch.onnx.export(captured, dynamo=True, verbose=False, input_names=names, output_names=["output"])
-            assert exact is not None
-            exact.save(path)
+            graph, names = capture(program, steps[0]), list(steps[0])
+            export = torch.onnx.export(graph, dynamo=True, verbose=False, input_names=names, output_names=["output"])
+            assert export is not None
+            export.save(path)
             difference = _difference(program, open_onnx(path), steps, span if part == "act" else None)
             log.info("%s: largest difference %.1e", path.name, difference)
             if not difference <= TOLERANCE:  # also for NaN
@@ -155,11 +155,11 @@ def open_onnx(path: Path) -> Run:
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # of its own kinds
         raise UserError(f"{path} is damaged: delete its folder, and the policy is exported again") from error
-    used = {node.name for node in session.get_inputs()}  # without inputs that the program ignores
+    names = {node.name for node in session.get_inputs()}  # without inputs that the program ignores
 
     def run(inputs: Inputs) -> Tensor:
-        given = {name: value.numpy() for name, value in inputs.items() if name in used}
-        return torch.from_numpy(session.run(None, given)[0])
+        arrays = {name: value.numpy() for name, value in inputs.items() if name in names}
+        return torch.from_numpy(session.run(None, arrays)[0])
 
     return run
 
@@ -167,8 +167,8 @@ def open_onnx(path: Path) -> Run:
 def _difference(program: Run, exported: Run, steps: list[Inputs], span: Tensor | None) -> float:
     """Return the largest difference between two outputs, relative to `span` or else to the largest output."""
     with torch.inference_mode():
-        expected, found = (torch.stack([run(inputs) for inputs in steps]) for run in (program, exported))
-        return float(((found - expected).abs() / (expected.abs().max() if span is None else span)).max())
+        reference, output = (torch.stack([run(inputs) for inputs in steps]) for run in (program, exported))
+        return float(((output - reference).abs() / (reference.abs().max() if span is None else span)).max())
 
 
 def digest(model: Model, spec: Spec) -> str:
@@ -178,8 +178,8 @@ def digest(model: Model, spec: Spec) -> str:
     for file in sorted({inspect.getfile(kind) for kind in kinds}):
         content.update(Path(file).read_bytes())
     for name, module in model.named_modules():
-        plain = (bool, int, float, str, tuple)
-        options = {key: value for key, value in vars(module).items() if isinstance(value, plain)}
+        plain_types = (bool, int, float, str, tuple)
+        options = {key: value for key, value in vars(module).items() if isinstance(value, plain_types)}
         content.update(repr((name, type(module).__qualname__, options)).encode())
     for values in chain(model.parameters(), model.buffers()):
         content.update(values.detach().contiguous().numpy().tobytes())

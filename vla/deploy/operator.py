@@ -112,14 +112,14 @@ class Operator:
         The agent then waits for an instruction. Returns the simulator's description of the episode; "" without `reset`.
         """
         client = self.node.create_client(ChangeState, f"{AGENT}/change_state")
-        there = client.wait_for_service(SETTLED)
+        has_agent = client.wait_for_service(SETTLED)
         self.node.destroy_client(client)
         # The reset moves the arm: an active agent would pull it back.
-        active = there and self._change(Transition.TRANSITION_DEACTIVATE)
-        said = str(self.call(Trigger, f"{SIMULATOR}/reset", Trigger.Request()).message) if reset else ""
+        active = has_agent and self._change(Transition.TRANSITION_DEACTIVATE)
+        description = str(self.call(Trigger, f"{SIMULATOR}/reset", Trigger.Request()).message) if reset else ""
         if active and not self._change(Transition.TRANSITION_ACTIVATE):
             raise UserError("the agent cannot be activated again, see its log")
-        return said
+        return description
 
     def _change(self, transition: int) -> bool:
         request = ChangeState.Request(transition=Transition(id=transition))
@@ -152,10 +152,10 @@ class DemoOperator(Operator):
 
     def begin_episode(self) -> None:
         """Begin an episode, after the last has ended, and send its instruction."""
-        over = self._episode is not None and self._episode.done
-        if over:
+        is_over = self._episode is not None and self._episode.done
+        if is_over:
             self._episode = None
-        self.next_episode(reset=over)
+        self.next_episode(reset=is_over)
         self.wait(lambda: self._playing, "an episode")
         assert self._episode is not None
         self._words.publish(String(data=self._episode.instruction))

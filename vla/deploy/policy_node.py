@@ -33,7 +33,7 @@ class PolicyNode(GuardedLifecycleNode):
         super().__init__("vla_agent", context=context)
         self.policy, self.settings = policy, settings
         self.loop: ControlLoop | None = None  # while configured
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # runs even if simulated time is paused
+        self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)  # runs even if simulated time is paused
         self._timers: list[Any] = []  # while active
 
     @property
@@ -45,9 +45,9 @@ class PolicyNode(GuardedLifecycleNode):
     def on_configure(self, state: LifecycleState) -> None:
         """Check that policy, robot and topics match, warm the policy up, connect."""
         settings, topics, spec = self.settings, self.settings.topics, self.policy.spec
-        if unnamed := sorted(set(spec.cameras) - set(topics.images)):
-            missing = ", ".join(unnamed)
-            raise UserError(f"no topic for cameras {missing}: add +deploy.topics.images.{unnamed[0]}=TOPIC")
+        if missing_cameras := sorted(set(spec.cameras) - set(topics.images)):
+            names = ", ".join(missing_cameras)
+            raise UserError(f"no topic for cameras {names}: add +deploy.topics.images.{missing_cameras[0]}=TOPIC")
         execute = executed(self.policy) if getattr(self.policy, "chunking", None) else None
         follows = not settings.dry_run
         loop = ControlLoop(spec, settings.robot, settings.safety, settings.command_hz, follows, execute)
@@ -82,16 +82,16 @@ class PolicyNode(GuardedLifecycleNode):
         self._inference.forget()
         self._last_tick: float | None = None
         self._timers = [
-            self.create_timer(self.loop.tick, self.guard(self._tick), clock=self._steady),
-            self.create_timer(1.0, self.guard(self._check_publishers), clock=self._steady),
+            self.create_timer(self.loop.tick, self.guard(self._tick), clock=self._steady_clock),
+            self.create_timer(1.0, self.guard(self._check_publishers), clock=self._steady_clock),
         ]
         super().on_activate(state)
 
     def _require_command(self) -> None:
         """Raise a UserError if another node commands the arm, or an action server is not there."""
         topic = self._arm.publisher.topic_name
-        if (others := self.count_publishers(topic) - 1) > 0:
-            raise UserError(f"{others} other publisher(s) on {topic}: stop them first")
+        if (count := self.count_publishers(topic) - 1) > 0:
+            raise UserError(f"{count} other publisher(s) on {topic}: stop them first")
         for sender in self._senders:
             sender.prepare()
         if self._gripper:
@@ -154,8 +154,8 @@ class PolicyNode(GuardedLifecycleNode):
 
     def _on_resume(self, request: Any, response: Any) -> Any:
         loop = self.loop if self.active else None
-        going = (State.RUNNING, State.HOLDING)  # an instruction that came before has ended a stop by time-out
-        response.success = loop is not None and (loop.resume(time.monotonic()) or loop.state in going)
+        running_states = (State.RUNNING, State.HOLDING)  # an instruction that came before has ended a stop by time-out
+        response.success = loop is not None and (loop.resume(time.monotonic()) or loop.state in running_states)
         response.message = "" if response.success else f"nothing to resume: {loop.reason if loop else 'inactive'}"
         return response
 
@@ -194,8 +194,8 @@ class PolicyNode(GuardedLifecycleNode):
         loop, inference = self.loop, self._inference
         assert loop is not None
         try:
-            if (done := inference.take()) is not None:
-                plan, seconds = done
+            if (result := inference.take()) is not None:
+                plan, seconds = result
                 follows, delay = loop.set_plan(plan), time.monotonic() - loop.observed_at
                 if follows:
                     loop.delays.add(delay)
@@ -224,6 +224,6 @@ class PolicyNode(GuardedLifecycleNode):
             self.loop.fail(f"another node commands the arm on {commands}")
         topics = {self.resolve_topic_name(self.settings.topics.images[camera]) for camera in self.policy.spec.cameras}
         counts = {topic: self.count_publishers(topic) for topic in sorted(topics)}
-        several = [f"{count} publishers send images on {topic}" for topic, count in counts.items() if count > 1]
-        self.loop.obstacle = ", ".join(several)
+        conflicts = [f"{count} publishers send images on {topic}" for topic, count in counts.items() if count > 1]
+        self.loop.obstacle = ", ".join(conflicts)
         self.diagnostics.report()

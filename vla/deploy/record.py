@@ -40,7 +40,7 @@ class BagRecorder:
         self._node, self._folder, self.messages = node, folder, 0
         self._writer = bags.Writer(folder, version=9, storage_plugin=bags.StoragePlugin.MCAP)
         self._writer.open()
-        self._known, self._subscriptions = set[str](), list[Any]()
+        self._topics, self._subscriptions = set[str](), list[Any]()
         self._discover()
         self._timer = node.create_timer(DISCOVERY_PERIOD, self._discover)
 
@@ -58,17 +58,17 @@ class BagRecorder:
         latched = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # also what was published before
         for topic, (kind, *_) in self._node.get_topic_names_and_types():
             package, _, name = kind.partition("/msg/")
-            if topic in self._known or package not in MESSAGE_PACKAGES:
+            if topic in self._topics or package not in MESSAGE_PACKAGES:
                 continue
-            self._known.add(topic)
+            self._topics.add(topic)
             if kind not in message_types().fielddefs:  # of another ROS distribution, or a custom type
                 self._node.get_logger().warning(f"{shorten(topic)} is not recorded: unknown type {shorten(kind)}")
                 continue
-            offered = [info.qos_profile.durability for info in self._node.get_publishers_info_by_topic(topic)]
-            qos = latched if {*offered} == {latched.durability} else best_effort
-            write = partial(self._write, self._writer.add_connection(topic, kind, typestore=message_types()))
+            durabilities = [info.qos_profile.durability for info in self._node.get_publishers_info_by_topic(topic)]
+            qos = latched if {*durabilities} == {latched.durability} else best_effort
+            callback = partial(self._write, self._writer.add_connection(topic, kind, typestore=message_types()))
             message = getattr(import_module(f"{package}.msg"), name)
-            self._subscriptions.append(self._node.create_subscription(message, topic, write, qos, raw=True))
+            self._subscriptions.append(self._node.create_subscription(message, topic, callback, qos, raw=True))
 
     def _write(self, connection: Any, message: bytes) -> None:
         if shutil.disk_usage(self._folder).free < RESERVE:
@@ -83,9 +83,9 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="folder of the bag, which must not exist")
     parser.add_argument("--network", choices=NETWORKS, default="loopback", help="deploy.network.reach of the agent")
     options = parser.parse_args()
-    with command_node("vla_record", options.network) as (node, stopped):
+    with command_node("vla_record", options.network) as (node, stop_event):
         with closing(BagRecorder(node, options.folder)) as recorder:
-            spin(node, stopped)
+            spin(node, stop_event)
         print(f"{counted(recorder.messages, 'message')} in {options.folder}")
 
 

@@ -92,14 +92,14 @@ def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
             f"this version of Python ({error})"
         ) from error
     hangup = () if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (signal.SIGHUP,)  # ignored by nohup
-    with stopped_by(signal.SIGINT, signal.SIGTERM, *hangup) as stopped:
+    with stopped_by(signal.SIGINT, signal.SIGTERM, *hangup) as stop_event:
         try:
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         except RuntimeError as error:
-            given = shlex.join(arguments) or "its environment"
-            raise UserError(f"ROS does not accept {given}: {str(error).splitlines()[0]}") from error
+            settings = shlex.join(arguments) or "its environment"
+            raise UserError(f"ROS does not accept {settings}: {str(error).splitlines()[0]}") from error
         try:
-            yield stopped
+            yield stop_event
         finally:
             rclpy.try_shutdown()
 
@@ -121,11 +121,11 @@ def command_node(name: str, network: Reach) -> Iterator[tuple[Any, Event]]:
 
     Yields the node, and the event of `ros`.
     """
-    with plain_errors(), ros(RosNetwork(network, None, None)) as stopped:
+    with plain_errors(), ros(RosNetwork(network, None, None)) as stop_event:
         from rclpy import create_node
 
         node = create_node(name)
-        yield node, stopped
+        yield node, stop_event
         node.destroy_node()
 
 

@@ -22,7 +22,7 @@ class PolicyDeployment(PolicySettings):
         if self.gripper is not None:
             self.gripper.goals("gripper")
         policy = self.policy()
-        with ros(self.network, self.output) as stopped:
+        with ros(self.network, self.output) as stop_event:
             from vla.deploy.lifecycle_node import SUCCESS
             from vla.deploy.policy_node import PolicyNode
 
@@ -31,7 +31,7 @@ class PolicyDeployment(PolicySettings):
                 for step in (agent.trigger_configure, agent.trigger_activate) if self.autostart else ():
                     if step() != SUCCESS:
                         raise UserError("the agent cannot start, see its log above")
-                spin(agent, stopped)
+                spin(agent, stop_event)
             finally:
                 agent.brake()
                 agent.destroy_node()
@@ -46,12 +46,12 @@ class SimulatorDeployment(SimulatorSettings):
     def run(self) -> None:
         """Play episodes until interrupted."""
         environment = self.environment()
-        with ros(self.network, self.output) as stopped:
+        with ros(self.network, self.output) as stop_event:
             from vla.deploy.simulator_node import SimulatorNode
 
             node = SimulatorNode(environment, self)
             try:
-                spin(node, stopped)
+                spin(node, stop_event)
             finally:
                 node.destroy_node()
                 environment.close()

@@ -54,11 +54,11 @@ class Tracking:
     def check(self, motion: Motion, newest: Measured, now: float) -> tuple[bool, bool]:
         """Return whether the arm is off its commands for too long, and whether it moved while no joint state came."""
         error = float(np.abs(motion.limiter.position - newest.joints).max())
-        away = motion.started and self._follows_positions and error > self._safety.tracking
+        deviates = motion.started and self._follows_positions and error > self._safety.tracking
         was_lost, self._lost = self._lost, now - newest.at > self._safety.joints_age
-        if self._lost or not away:
+        if self._lost or not deviates:
             self._away_since = None
         elif self._away_since is None:
             self._away_since = now
         off_track = self._away_since is not None and now - self._away_since > self._safety.tracking_for
-        return off_track, away and was_lost and not self._lost
+        return off_track, deviates and was_lost and not self._lost

@@ -35,10 +35,10 @@ def main() -> None:
         parser.error(f"--topic {options.topic!r} is not a valid ROS name")
     if (length := len(options.instruction or "")) > LONGEST_INSTRUCTION:
         sys.exit(f"error: the instruction has {length} characters, the limit is {LONGEST_INSTRUCTION}")
-    with command_node("vla_say", options.network) as (node, stopped):
+    with command_node("vla_say", options.network) as (node, stop_event):
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_DFL)  # end at once: there is no arm to brake here
-        if stopped.is_set():  # by a signal that came before that
+        if stop_event.is_set():  # by a signal that came before that
             signal.raise_signal(signal.SIGINT)
         from vla.deploy.operator import Operator
 

@@ -97,8 +97,8 @@ class PolicyServer:
                 log.info("serving the policy at %s", url)
                 stop.wait()
         except OSError as error:
-            where = f"deploy.host={self.host} deploy.port={self.port}"
-            raise UserError(f"cannot listen at {where}: {error.strerror}; deploy.port=0 is any free one") from error
+            address = f"deploy.host={self.host} deploy.port={self.port}"
+            raise UserError(f"cannot listen at {address}: {error.strerror}; deploy.port=0 is any free one") from error
 
 
 class Service:
@@ -108,7 +108,7 @@ class Service:
         self._settings, self._policy = settings, policy
         self._waiting: asyncio.Queue[tuple[int, Observation, asyncio.Future[Array]]] = asyncio.Queue()
         self._lanes = set[int]()  # of the policy, one for each connection
-        self._warned = deque([-math.inf] * WARNINGS, WARNINGS)  # times of the last warnings [s]
+        self._warning_times = deque([-math.inf] * WARNINGS, WARNINGS)  # times of the last warnings [s]
 
     @contextmanager
     def in_thread(self) -> Iterator[str]:
@@ -117,21 +117,21 @@ class Service:
             loop, url, stop = runner.get_loop(), queue.Queue[str](), asyncio.Event()
 
             async def serve() -> None:
-                async with self._listening() as here:
-                    url.put(here)
+                async with self._listen() as address:
+                    url.put(address)
                     await stop.wait()
 
-            served = thread.submit(runner.run, serve())
-            served.add_done_callback(lambda _: url.put(""))  # it could not start
+            future = thread.submit(runner.run, serve())
+            future.add_done_callback(lambda _: url.put(""))  # it could not start
             try:
-                if here := url.get():
-                    yield here
+                if address := url.get():
+                    yield address
             finally:
                 loop.call_soon_threadsafe(stop.set)
-                served.result()
+                future.result()
 
     @asynccontextmanager
-    async def _listening(self) -> AsyncIterator[str]:
+    async def _listen(self) -> AsyncIterator[str]:
         """Serve within the context; yield the URL once the first client can be answered."""
         settings, policy = self._settings, self._policy
         options: dict[str, Any] = {"compression": None, "max_size": settings.largest_message, "max_queue": 1}
@@ -151,9 +151,9 @@ class Service:
         """Answer health checks; reject clients without the key, or beyond `connections`."""
         if request.path == "/healthz":
             return connection.respond(HTTPStatus.OK, "OK\n")
-        key, given = self._settings.api_key, "".join(request.headers.get_all("Authorization"))
+        key, header = self._settings.api_key, "".join(request.headers.get_all("Authorization"))
         if key is not None and not hmac.compare_digest(
-            given.encode(errors="surrogateescape"), f"Api-Key {key}".encode()
+            header.encode(errors="surrogateescape"), f"Api-Key {key}".encode()
         ):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "send the API key as Authorization: Api-Key …\n")
         if len(self._lanes) >= self._settings.connections:
@@ -188,8 +188,8 @@ class Service:
 
     def _warn(self, text: str, *values: str, exc_info: bool = False) -> None:
         """Log a warning, unless there were `WARNINGS` within a minute: a client could fill the disk with them."""
-        if (now := time.monotonic()) > self._warned[0] + 60:
-            self._warned.append(now)
+        if (now := time.monotonic()) > self._warning_times[0] + 60:
+            self._warning_times.append(now)
             log.warning(text, *values, exc_info=exc_info)
 
     async def _answer(self, lane: int, data: str | bytes) -> dict[str, Any]:
@@ -214,9 +214,9 @@ class Service:
             while len(group) < self._policy.lanes and not self._waiting.empty():
                 group.append(self._waiting.get_nowait())
             lanes, observations, results = zip(*group, strict=True)
-            planned = asyncio.get_running_loop().run_in_executor(thread, self._policy.plan, observations, lanes)
+            plans = asyncio.get_running_loop().run_in_executor(thread, self._policy.plan, observations, lanes)
             try:
-                for result, actions in zip(results, await planned, strict=True):
+                for result, actions in zip(results, await plans, strict=True):
                     result.set_result(actions)
             except Exception as error:
                 for result in results:

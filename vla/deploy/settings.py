@@ -36,8 +36,8 @@ class Topics:
     finger_states: str | None  # sensor_msgs/JointState of the fingers, if these come on another topic than the arm
 
     def __post_init__(self) -> None:
-        named = {**asdict(self), **{f"images.{camera}": topic for camera, topic in self.images.items()}}
-        for key, topic in named.items():
+        topics = {**asdict(self), **{f"images.{camera}": topic for camera, topic in self.images.items()}}
+        for key, topic in topics.items():
             if isinstance(topic, str) and not NAME.fullmatch(topic):
                 raise UserError(f"topics.{key} is {topic!r}, expected letters, digits and _ between slashes")
 
@@ -62,15 +62,15 @@ class GripperCommand:
     def goals(self, server: str) -> tuple[Goal, Goal]:
         """Return the goals that close and open it; raise a UserError if the messages are not installed."""
         kind = action_class("control_msgs", "GripperCommand")
-        closing, opening = kind.Goal(), kind.Goal()
-        for goal, position in ((closing, self.closed), (opening, self.open)):  # YAML may hold whole numbers
+        close_goal, open_goal = kind.Goal(), kind.Goal()
+        for goal, position in ((close_goal, self.closed), (open_goal, self.open)):  # YAML may hold whole numbers
             goal.command.position, goal.command.max_effort = float(position), float(self.effort)
 
         def complaint(result: Any, replaced: bool) -> str:
             # A stalled gripper has grasped something, which is no error.
             return "" if result.stalled else "it does not reach its position"
 
-        return Goal(kind, server, closing, complaint), Goal(kind, server, opening, complaint)
+        return Goal(kind, server, close_goal, complaint), Goal(kind, server, open_goal, complaint)
 
 
 @dataclass(frozen=True)
@@ -87,13 +87,13 @@ class FrankaGripper:
         """Return the goals that close and open it; raise a UserError if the messages are not installed."""
         grasp, move = (action_class("franka_msgs", name) for name in ("Grasp", "Move"))
         speed, force = float(self.speed), float(self.force)  # YAML may hold whole numbers
-        opening = move.Goal(width=float(self.open), speed=speed)
-        closing = grasp.Goal(width=float(self.closed), speed=speed, force=force)
-        closing.epsilon.inner, closing.epsilon.outer = map(float, self.epsilon)
+        open_goal = move.Goal(width=float(self.open), speed=speed)
+        close_goal = grasp.Goal(width=float(self.closed), speed=speed, force=force)
+        close_goal.epsilon.inner, close_goal.epsilon.outer = map(float, self.epsilon)
         return (
             # A missed grasp has an empty error text, so only errors of the driver count.
-            Goal(grasp, f"{server}/grasp", closing, lambda result, _: result.error),
-            Goal(move, f"{server}/move", opening, lambda result, _: result.error or "it does not reach its width"),
+            Goal(grasp, f"{server}/grasp", close_goal, lambda result, _: result.error),
+            Goal(move, f"{server}/move", open_goal, lambda result, _: result.error or "it does not reach its width"),
         )
 
 
@@ -102,8 +102,8 @@ def action_class(package: str, name: str) -> Any:
     try:
         return getattr(import_module(f"{package}.action"), name)
     except (ImportError, AttributeError) as error:
-        apt = f"apt install ros-jazzy-{package.replace('_', '-')}"
-        source = "build franka_ros2" if package == "franka_msgs" else apt
+        command = f"apt install ros-jazzy-{package.replace('_', '-')}"
+        source = "build franka_ros2" if package == "franka_msgs" else command
         raise UserError(
             f"{package}/action/{name} is not installed: {source}, and source its setup.bash before the start ({error})"
         ) from error

@@ -102,8 +102,8 @@ class SimulatorNode(Node):
 
     def _tick(self) -> None:
         """Advance the simulation by one tick, then publish the measurements."""
-        silent = 0.0 if self._commanded_at is None else time.monotonic() - self._commanded_at
-        if silent > self._command_timeout:
+        silence = 0.0 if self._commanded_at is None else time.monotonic() - self._commanded_at
+        if silence > self._command_timeout:
             self.get_logger().warning("no commands: the arm holds its pose", throttle_duration_sec=5.0)
             self._target, self._commanded_at = self._hold_command(), None
         self._drivable.drive(*self._target, self._period)
@@ -112,14 +112,14 @@ class SimulatorNode(Node):
             self._drivable.judge()
             if self.environment.done:
                 self._running = False
-                after = "in" if self.environment.outcome == "success" else "after"
-                self.get_logger().info(f"{self.environment.outcome} {after} {self._ticks * self._period:.1f} s")
+                preposition = "in" if self.environment.outcome == "success" else "after"
+                self.get_logger().info(f"{self.environment.outcome} {preposition} {self._ticks * self._period:.1f} s")
                 self._publish_episode()
         self._publish()
 
     def _publish(self) -> None:
         stamp = self.get_clock().now().to_msg()
-        joints, velocities, opening = self._measured()
+        joints, velocities, opening = self._measure()
         fingers = len(self._limits.fingers)
         message = JointState(name=[*self._limits.joints, *self._limits.fingers])
         message.position = [*joints.tolist(), *[opening / max(fingers, 1)] * fingers]
@@ -136,10 +136,10 @@ class SimulatorNode(Node):
 
     def _hold_command(self) -> tuple[Array, float]:
         """Return the command that holds the measured pose: joints [rad] and opening 0 … 1."""
-        joints, _, opening = self._measured()
+        joints, _, opening = self._measure()
         return joints.astype(float), opening / self._limits.stroke
 
-    def _measured(self) -> tuple[Array, Array, float]:
+    def _measure(self) -> tuple[Array, Array, float]:
         """Return joints [rad], their velocities [rad/s] and the gripper's opening [m]."""
         spec, model = self.environment.spec, self._model
         with self.environment.blind():
@@ -150,6 +150,6 @@ class SimulatorNode(Node):
     def _publish_episode(self) -> None:
         world = self.environment
         steps, seconds = self._ticks // self._ticks_per_step, self._ticks * self._period
-        ended = (world.done, steps, seconds, world.outcome, world.task, tuple(sorted(world.milestones)))
-        episode = SimulatedEpisode(self.seed, self.instruction, *ended)
+        result = (world.done, steps, seconds, world.outcome, world.task, tuple(sorted(world.milestones)))
+        episode = SimulatedEpisode(self.seed, self.instruction, *result)
         self._episode.publish(String(data=json.dumps(asdict(episode))))

@@ -22,26 +22,26 @@ class DmEnvironment(dm_env.Environment):
 
     def __init__(self, environment: Environment, random_state: int | np.random.RandomState | None = None) -> None:
         """Wrap an environment; `random_state` draws the seeds of episodes, which are below those of evaluation."""
-        self.environment, self._over = environment, True
-        given = isinstance(random_state, np.random.RandomState)
-        self.random_state = random_state if given else np.random.RandomState(random_state)
+        self.environment, self._episode_over = environment, True
+        is_generator = isinstance(random_state, np.random.RandomState)
+        self.random_state = random_state if is_generator else np.random.RandomState(random_state)
 
     def reset(self, seed: int | None = None) -> TimeStep:
         """Start the episode of `seed`, or of a random seed."""
         episode = int(self.random_state.randint(FIRST_SEED)) if seed is None else seed
-        self._over = False
+        self._episode_over = False
         return dm_env.restart(_arrays(self.environment.reset(episode)))
 
     def step(self, action: Array) -> TimeStep:
         """Apply one (D,) action for one control period, or start a new episode after the last one ended."""
-        if self._over:
+        if self._episode_over:
             return self.reset()
         observation = _arrays(self.environment.step(action))
-        self._over = self.environment.done
+        self._episode_over = self.environment.done
         outcome = self.environment.outcome
-        if outcome == "success" or (self._over and outcome == "failure"):
+        if outcome == "success" or (self._episode_over and outcome == "failure"):
             return dm_env.termination(float(outcome == "success"), observation)
-        return dm_env.truncation(0.0, observation) if self._over else dm_env.transition(0.0, observation)
+        return dm_env.truncation(0.0, observation) if self._episode_over else dm_env.transition(0.0, observation)
 
     def observation_spec(self) -> dict[str, specs.Array]:
         """Return the shapes and dtypes of an observation."""
@@ -68,6 +68,6 @@ def load(task: str, random_state: int | np.random.RandomState | None = None, **o
     return DmEnvironment(make_environment(compose_task(task, **overrides)), random_state)
 
 
-def _arrays(seen: Observation) -> dict[str, Array]:
-    images = {camera: np.ascontiguousarray(image) for camera, image in seen.rgb.items()}  # for torch
-    return {**images, "state": seen.state, "instruction": np.array(seen.instruction, dtype=object)}
+def _arrays(observation: Observation) -> dict[str, Array]:
+    images = {camera: np.ascontiguousarray(image) for camera, image in observation.rgb.items()}  # for torch
+    return {**images, "state": observation.state, "instruction": np.array(observation.instruction, dtype=object)}

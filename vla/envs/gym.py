@@ -65,8 +65,8 @@ class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
         """Apply one (D,) action for one control period."""
         observation = self._arrays(self.environment.step(action))
         outcome, done = self.environment.outcome, self.environment.done
-        ended = outcome == "success" or (done and outcome == "failure")  # a time limit truncates instead
-        return observation, float(outcome == "success"), ended, done and not ended, self._info()
+        terminated = outcome == "success" or (done and outcome == "failure")  # a time limit truncates instead
+        return observation, float(outcome == "success"), terminated, done and not terminated, self._info()
 
     def render(self) -> Array | None:
         """Return the newest images side by side, (H, C·W, 3) uint8."""

@@ -52,14 +52,14 @@ class LeRobotEnvironment(Task):
 
         To seeds of training, such as LeRobot's default ones, `FIRST_SEED` is added.
         """
-        given = int(self.np_random.integers(FIRST_SEED)) if seed is None else seed
-        return super().reset(seed=given + FIRST_SEED * (given < FIRST_SEED), options=options)
+        base_seed = int(self.np_random.integers(FIRST_SEED)) if seed is None else seed
+        return super().reset(seed=base_seed + FIRST_SEED * (base_seed < FIRST_SEED), options=options)
 
     def _arrays(self, observation: Observation) -> dict[str, Any]:
-        seen = super()._arrays(observation)
+        values = super()._arrays(observation)
         self.task_description, self.task = observation.instruction, self.environment.task
-        vectors = {AGENT[key]: seen["state"][part] for key, part in _parts(self.vla_spec).items()}
-        return {"pixels": {camera: seen[camera] for camera in self.vla_spec.cameras}, **vectors}
+        vectors = {AGENT[key]: values["state"][part] for key, part in _parts(self.vla_spec).items()}
+        return {"pixels": {camera: values[camera] for camera in self.vla_spec.cameras}, **vectors}
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self.environment.outcome == "success"}
@@ -87,12 +87,12 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
         UserError: an entry is missing or has another shape.
     """
     parts = _parts(spec)
-    given = spec.given([PICTURE] if IMAGE in batch else [])
-    single = given if IMAGE in batch and len(given) == 1 else []  # the only image of batch and policy
-    keys = {name: IMAGE if name in (PICTURE, *single) else f"{IMAGES}{name}" for name in given}
-    needed = [*keys.values(), *parts, TASK]
-    if missing := [key for key in needed if key not in batch]:
-        raise UserError(f"the policy needs {', '.join(missing)}, but the batch has {', '.join(map(str, batch))}")
+    image_names = spec.given([PICTURE] if IMAGE in batch else [])
+    sole_image = image_names if IMAGE in batch and len(image_names) == 1 else []  # the only image of batch and policy
+    keys = {name: IMAGE if name in (PICTURE, *sole_image) else f"{IMAGES}{name}" for name in image_names}
+    entries = [*keys.values(), *parts, TASK]
+    if missing_keys := [key for key in entries if key not in batch]:
+        raise UserError(f"the policy needs {', '.join(missing_keys)}, but the batch has {', '.join(map(str, batch))}")
     count = len(batch[STATE])
     state = np.zeros((count, len(spec.state)), np.float32)
     for key, indices in parts.items():

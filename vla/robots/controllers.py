@@ -59,10 +59,10 @@ def controller_for(
     if acts_on_joints(spec):
         return _joint_controller(spec, model, workspace)
     arm = _kinematics(model, limits)
-    found = list(zip(spec.action, spec.units, strict=True))
+    action = list(zip(spec.action, spec.units, strict=True))
     expected = [*CartesianController.motion, (GRIPPER, "1")]
-    if found != expected:
-        raise UserError(f"the policy's action is {_listed(found)}, expected {_listed(expected)}, or all joints")
+    if action != expected:
+        raise UserError(f"the policy's action is {_listing(action)}, expected {_listing(expected)}, or all joints")
     if workspace is None:
         raise UserError("Cartesian motion needs a box for the tool point: set deploy.safety.workspace to its corners")
     if ((arm.home < arm.lowest) | (arm.home > arm.highest)).any():
@@ -85,8 +85,8 @@ def _kinematics(model: RobotModel, limits: tuple[Array, Array, Array] | None) ->
 
 
 def _joint_controller(spec: Spec, model: RobotModel, workspace: tuple[Point, Point] | None) -> JointController:
-    if others := [name for name in spec.action if name not in (*model.joints, GRIPPER)]:
-        raise UserError(f"the policy's action has {', '.join(others)}, which are no joints of its robot")
+    if extra_names := [name for name in spec.action if name not in (*model.joints, GRIPPER)]:
+        raise UserError(f"the policy's action has {', '.join(extra_names)}, which are no joints of its robot")
     # The units of the state must be known too.
     _factors(model.joints, dict(zip(spec.state, spec.state_units, strict=True)))
     if workspace is not None:
@@ -123,13 +123,13 @@ def gripper_index(spec: Spec) -> int | None:
 
 
 def _factors(joints: Iterable[str], units: dict[str, str]) -> Array:
-    if unknown := [(name, units[name]) for name in joints if units[name] not in UNITS]:
+    if misfits := [(name, units[name]) for name in joints if units[name] not in UNITS]:
         raise UserError(
-            f"the joints {_listed(unknown)} must have one of the units {', '.join(UNITS)}: name it with task.units "
+            f"the joints {_listing(misfits)} must have one of the units {', '.join(UNITS)}: name it with task.units "
             "before training"
         )
     return np.array([UNITS[units[name]] for name in joints])
 
 
-def _listed(components: list[tuple[str, str]]) -> str:
+def _listing(components: list[tuple[str, str]]) -> str:
     return ", ".join(f"{name} [{unit}]" for name, unit in components)

@@ -62,14 +62,14 @@ def forward(joints: Array) -> tuple[Array, Array]:
         (4, 4) homogeneous pose [m] and (6, 7) Jacobian, linear rows [m/rad] before angular rows.
     """
     cosine, sine = np.cos(joints)[:, None], np.sin(joints)[:, None]
-    moved = _LINKS.copy()
+    frames = _LINKS.copy()
     x, y = _LINKS[:, :, 0], _LINKS[:, :, 1]
-    moved[:, :, 0], moved[:, :, 1] = cosine * x + sine * y, cosine * y - sine * x
+    frames[:, :, 0], frames[:, :, 1] = cosine * x + sine * y, cosine * y - sine * x
     for index in range(1, 7):
-        moved[index] = moved[index - 1].dot(moved[index])  # half the time of np.matmul for such small matrices
-    pose = moved[6] @ _TOOL
+        frames[index] = frames[index - 1].dot(frames[index])  # half the time of np.matmul for such small matrices
+    pose = frames[6] @ _TOOL
     # A joint's own rotation changes neither its axis nor its origin.
-    (ax, ay, az), (x, y, z) = moved[:, :3, 2].T, pose[:3, 3:] - moved[:, :3, 3].T
+    (ax, ay, az), (x, y, z) = frames[:, :3, 2].T, pose[:3, 3:] - frames[:, :3, 3].T
     # Linear rows: axis cross lever arm, written out because np.cross would take longer than everything else here.
     return pose, np.array([ay * z - az * y, az * x - ax * z, ax * y - ay * x, ax, ay, az])
 

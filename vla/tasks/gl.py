@@ -43,14 +43,14 @@ def choose_backend() -> None:
     with suppress(ImportError):
         import triton  # noqa: F401
     choose_device()
-    chosen = os.environ.get("MUJOCO_GL")
-    known = chosen in (NO_BACKEND, os.environ.get(WORKING_BACKEND, NO_BACKEND))
-    if known or sys.platform != "linux":
+    setting = os.environ.get("MUJOCO_GL")
+    is_known = setting in (NO_BACKEND, os.environ.get(WORKING_BACKEND, NO_BACKEND))
+    if is_known or sys.platform != "linux":
         return
-    candidates = [chosen] if chosen else [*(["glfw"] if os.environ.get("DISPLAY") else []), "egl", "osmesa"]
-    works = next((name for name in candidates if _output(PROBE, MUJOCO_GL=name) is not None), None)
-    os.environ["MUJOCO_GL"] = works or NO_BACKEND
-    os.environ[WORKING_BACKEND if works else FAILED_BACKENDS] = works or " or ".join(candidates)
+    candidates = [setting] if setting else [*(["glfw"] if os.environ.get("DISPLAY") else []), "egl", "osmesa"]
+    backend = next((name for name in candidates if _output(PROBE, MUJOCO_GL=name) is not None), None)
+    os.environ["MUJOCO_GL"] = backend or NO_BACKEND
+    os.environ[WORKING_BACKEND if backend else FAILED_BACKENDS] = backend or " or ".join(candidates)
 
 
 def choose_device() -> None:
@@ -58,19 +58,19 @@ def choose_device() -> None:
 
     A device that the user has set by MUJOCO_EGL_DEVICE_ID is kept.
     """
-    chosen = os.environ.get("MUJOCO_EGL_DEVICE_ID")
-    if chosen is None and (devices := _egl_devices()):
-        chosen = devices[int(os.environ.get(WORKER, "0")) % len(devices)]
-        os.environ["MUJOCO_EGL_DEVICE_ID"] = chosen
-    if chosen is not None:
-        os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", chosen)  # of moderngl
+    device = os.environ.get("MUJOCO_EGL_DEVICE_ID")
+    if device is None and (devices := _egl_devices()):
+        device = devices[int(os.environ.get(WORKER, "0")) % len(devices)]
+        os.environ["MUJOCO_EGL_DEVICE_ID"] = device
+    if device is not None:
+        os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", device)  # of moderngl
 
 
 def _egl_devices() -> list[str]:
     """Return the numbers of the GPUs that EGL can draw on; an empty list on a machine with a single GPU."""
     if EGL_DEVICES not in os.environ:
-        several = len([*Path("/dev").glob("nvidia[0-9]*"), *Path("/dev/dri").glob("renderD*")]) > 1
-        os.environ[EGL_DEVICES] = _output(DEVICES_PROBE, MUJOCO_GL="egl") or "" if several else ""
+        has_several = len([*Path("/dev").glob("nvidia[0-9]*"), *Path("/dev/dri").glob("renderD*")]) > 1
+        os.environ[EGL_DEVICES] = _output(DEVICES_PROBE, MUJOCO_GL="egl") or "" if has_several else ""
     return os.environ[EGL_DEVICES].split()
 
 
@@ -93,5 +93,5 @@ def has_egl() -> bool:
 def _output(code: str, **settings: str) -> str | None:
     """Return what code prints in a process of its own, which a failing GL backend can abort; None if it fails."""
     environment = {**os.environ, **settings}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
-    return done.stdout if done.returncode == 0 else None
+    process = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    return process.stdout if process.returncode == 0 else None

@@ -91,8 +91,8 @@ class Gymnasium(World):
             raise UserError(f"task.id={id} cannot be played: {error}") from error
         names = list[str]()
         for (path, components), label in zip(state.items(), _labels([*state]), strict=True):
-            names += _named(path, _get(values, path), components, label)
-        actions = _named("action", space.low, action, "action")
+            names += _component_names(path, _get(values, path), components, label)
+        actions = _component_names("action", space.low, action, "action")
         state_units, action_units = units_of(units, names, actions)
         rate = control_hz or self._environment.metadata.get("render_fps")
         if rate is None:
@@ -123,13 +123,13 @@ class Gymnasium(World):
     def step(self, action: Array) -> Observation:
         """Apply one (D,) action, clipped to the bounds."""
         self._require_running()
-        clipped = np.clip(action, self.spec.low, self.spec.high).astype(self._environment.action_space.dtype)
-        observation, _, terminated, truncated, info = self._environment.step(clipped)
+        command = np.clip(action, self.spec.low, self.spec.high).astype(self._environment.action_space.dtype)
+        observation, _, terminated, truncated, info = self._environment.step(command)
         values = self._values(observation, info)
-        reported = _get(values, self._success, None)
-        self.outcome = "success" if reported else "failure" if terminated else "timeout"
-        self.done = bool(reported) or terminated or truncated
-        self._success_reported |= reported is not None
+        success = _get(values, self._success, None)
+        self.outcome = "success" if success else "failure" if terminated else "timeout"
+        self.done = bool(success) or terminated or truncated
+        self._success_reported |= success is not None
         if self.done and not self._success_reported:
             self._success_reported = True
             log.warning("a whole episode gave no %s, so it counts as failed: is task.success right?", self._success)
@@ -140,13 +140,13 @@ class Gymnasium(World):
         self._environment.close()
 
     def _values(self, observation: Any, info: Mapping[str, Any]) -> dict[str, Any]:
-        drawn = RENDER in self._images.values() and not self._blind
-        return {OBSERVATION: observation, INFO: info, **({RENDER: self._environment.render()} if drawn else {})}
+        renders = RENDER in self._images.values() and not self._blind
+        return {OBSERVATION: observation, INFO: info, **({RENDER: self._environment.render()} if renders else {})}
 
     def _observe(self, values: Mapping[str, Any]) -> Observation:
         images, instruction = {} if self._blind else self._images, self._instruction
         return Observation(
-            rgb={name: _resized(name, _get(values, path), self._size) for name, path in images.items()},
+            rgb={name: _resize(name, _get(values, path), self._size) for name, path in images.items()},
             state=np.concatenate([np.ravel(_get(values, path)) for path in self._state]).astype(np.float32),
             instruction=str(_get(values, instruction)) if instruction.startswith(PATHS) else instruction,
             truth={name: np.ravel(_get(values, path)).astype(np.float32) for name, path in self._truth.items()},
@@ -181,14 +181,14 @@ def _make(package: str, id: str, options: Mapping[str, object], steps: int | Non
         raise UserError(f"{id} cannot be made with task.options={dict(options)}: {error}") from error
 
 
-def _bound(name: str, given: Numbers | float | None, own: Array) -> tuple[float, ...]:
+def _bound(name: str, setting: Numbers | float | None, defaults: Array) -> tuple[float, ...]:
     """Return the low or high bounds of an action, by default those of its space; a UserError if they do not fit it."""
-    if given is None:
-        bound = tuple(float(str(value)) for value in own)  # 0.1, not the 0.10000000149 of float32
+    if setting is None:
+        bound = tuple(float(str(value)) for value in defaults)  # 0.1, not the 0.10000000149 of float32
     else:
-        bound = (float(given),) * len(own) if isinstance(given, int | float) else tuple(given)
-    if len(bound) != len(own):
-        raise UserError(f"task.{name} has {len(bound)} numbers, an action has {len(own)} components")
+        bound = (float(setting),) * len(defaults) if isinstance(setting, int | float) else tuple(setting)
+    if len(bound) != len(defaults):
+        raise UserError(f"task.{name} has {len(bound)} numbers, an action has {len(defaults)} components")
     if not np.isfinite(bound).all():
         raise UserError(f"the actions have no bounds: set task.{name}, a number, or one per component")
     return bound
@@ -196,15 +196,15 @@ def _bound(name: str, given: Numbers | float | None, own: Array) -> tuple[float,
 
 def _get(values: Any, path: str, *default: Any) -> Any:
     """Return the value at a dotted path; a UserError if there is none, and no default."""
-    found = values
+    value = values
     for name in path.split("."):
-        if not isinstance(found, Mapping) or name not in found:
+        if not isinstance(value, Mapping) or name not in value:
             if default:
                 return default[0]
-            there = ", ".join(map(str, found)) if isinstance(found, Mapping) else "nothing further"
-            raise UserError(f"there is no {path} in what the environment returns: instead of {name} there is {there}")
-        found = found[name]
-    return found
+            names = ", ".join(map(str, value)) if isinstance(value, Mapping) else "nothing further"
+            raise UserError(f"there is no {path} in what the environment returns: instead of {name} there is {names}")
+        value = value[name]
+    return value
 
 
 def _labels(paths: Sequence[str]) -> Sequence[str]:
@@ -215,7 +215,7 @@ def _labels(paths: Sequence[str]) -> Sequence[str]:
     return paths
 
 
-def _named(path: str, values: Any, names: Names | None, label: str) -> tuple[str, ...]:
+def _component_names(path: str, values: Any, names: Names | None, label: str) -> tuple[str, ...]:
     """Return the names of an array's components, by default numbered labels; a UserError if their number differs."""
     size = np.size(values)
     if names is None:
@@ -225,7 +225,7 @@ def _named(path: str, values: Any, names: Names | None, label: str) -> tuple[str
     return tuple(names)
 
 
-def _resized(camera: str, picture: Any, size: tuple[int, int]) -> Array:
+def _resize(camera: str, picture: Any, size: tuple[int, int]) -> Array:
     picture = np.asarray(picture)
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
         raise UserError(

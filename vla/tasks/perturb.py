@@ -57,20 +57,20 @@ class Perturbation:
     def reset(self, spec: Spec, seed: int) -> None:
         """Draw the pace of an episode and its first excursion (UserError: the actions lack a named component)."""
         groups = self.move, (self.turn,) if self.turn else (), (self.gripper,) if self.gripper else ()
-        if unknown := [name for group in groups for name in group if name not in spec.action]:
-            raise UserError(f"expert.perturb names {', '.join(unknown)}, but an action has {', '.join(spec.action)}")
+        if misfits := [name for group in groups for name in group if name not in spec.action]:
+            raise UserError(f"expert.perturb names {', '.join(misfits)}, but an action has {', '.join(spec.action)}")
         self._move, self._turn, self._grip = ([spec.action.index(name) for name in group] for group in groups)
         self._motions = [index for index in range(len(spec.action)) if index not in self._grip]
         self._shut, self._wide = (np.array(bounds)[self._grip] for bounds in (spec.low, spec.high))
         self._random = np.random.default_rng([seed, 0x5EED])
         self._pace = np.random.default_rng([seed, 0xACE]).uniform(*self.pace)
-        self._left, self._open = 0, True
+        self._steps_left, self._open = 0, True
         self._turns = self._random.uniform() >= self.unturned
         if self._random.uniform() < self.start:
             self._begin(self.start_steps)
 
     def _begin(self, steps: Sequence[int]) -> None:
-        self._left = int(self._random.integers(steps[0], steps[1] + 1))
+        self._steps_left = int(self._random.integers(steps[0], steps[1] + 1))
         self._point = self._random.uniform(self.low, self.high)
         self._angle = self._random.uniform(-MAX_TURN, MAX_TURN)
         self._gripper = self._wide if self._random.uniform() >= self.closed else self._shut
@@ -91,15 +91,15 @@ class Perturbation:
             )
         opens = bool((clean[self._grip] >= (self._shut + self._wide) / 2).all())
         grasps, self._open = self._open and not opens, opens
-        if self._left == 0 and self._random.uniform() < self.rate and not steady:
+        if self._steps_left == 0 and self._random.uniform() < self.rate and not steady:
             self._begin(self.steps)
-        elif self._left == 0 and grasps and self._random.uniform() < self.missed:
+        elif self._steps_left == 0 and grasps and self._random.uniform() < self.missed:
             angle = self._random.uniform(-np.pi, np.pi)
-            self._left, self._angle, self._gripper = MISS_STEPS, 0.0, self._shut
+            self._steps_left, self._angle, self._gripper = MISS_STEPS, 0.0, self._shut
             self._point = tool + MISS * np.array([np.cos(angle), np.sin(angle), 0.0])[: len(tool)]
         action = clean.astype(float)
-        if self._left > 0:
-            self._left -= 1
+        if self._steps_left > 0:
+            self._steps_left -= 1
             action[self._move] = self._point - tool
             action[self._turn], action[self._grip] = self._angle, self._gripper
             return action
@@ -130,6 +130,6 @@ class Perturbed:
         self.info = {**self._expert.info, "clean": clean}
         if observation.truth is None:
             raise UserError("expert.perturb needs the simulator's truth, which this observation lacks")
-        needs = {name: self._expert.info[name] for name in ("must_turn", "steady") if name in self._expert.info}
-        executed = self._perturb(clean, observation.truth, **needs)
-        return np.clip(executed, self._spec.low, self._spec.high).astype(np.float32)
+        options = {name: self._expert.info[name] for name in ("must_turn", "steady") if name in self._expert.info}
+        action = self._perturb(clean, observation.truth, **options)
+        return np.clip(action, self._spec.low, self._spec.high).astype(np.float32)

@@ -18,9 +18,9 @@ def units_of(
     where the others get "1"; a UserError if there is no component of such a name."""
     if isinstance(units, str):
         return (units,) * len(state), (units,) * len(action)
-    if unknown := [name for name in units if name not in (*state, *action)]:
-        known = ", ".join(dict.fromkeys((*state, *action)))
-        raise UserError(f"task.units names {', '.join(unknown)}, the components are {known}")
+    if unknown_names := [name for name in units if name not in (*state, *action)]:
+        components = ", ".join(dict.fromkeys((*state, *action)))
+        raise UserError(f"task.units names {', '.join(unknown_names)}, the components are {components}")
     return tuple(units.get(name, "1") for name in state), tuple(units.get(name, "1") for name in action)
 
 
@@ -57,10 +57,10 @@ class Recorded(SpecOnly):
         state_units, action_units = units_of(units, state, action)
         if joints == "all":
             joints = tuple(action)
-        known = {**dict(zip(state, state_units, strict=True)), **dict(zip(action, action_units, strict=True))}
-        if lacking := [name for name in joints or () if known.get(name, "rad") not in UNITS]:
+        known_units = {**dict(zip(state, state_units, strict=True)), **dict(zip(action, action_units, strict=True))}
+        if misfits := [name for name in joints or () if known_units.get(name, "rad") not in UNITS]:
             raise UserError(
-                f"task.joints names {', '.join(lacking)}, whose unit must be one of {', '.join(UNITS)}: name it with "
+                f"task.joints names {', '.join(misfits)}, whose unit must be one of {', '.join(UNITS)}: name it with "
                 "task.units, or leave the joint out"
             )
         spec = Spec(

@@ -36,11 +36,11 @@ class World:
     @contextmanager
     def blind(self) -> Iterator[None]:
         """Return no images within this context, which makes steps several times faster."""
-        before, self._blind = self._blind, True
+        was_blind, self._blind = self._blind, True
         try:
             yield
         finally:
-            self._blind = before
+            self._blind = was_blind
 
 
 class ManyTasks(World):

@@ -52,17 +52,17 @@ class LeRobotPolicy:
     @torch.inference_mode()
     def act(self, observation: Observation) -> Array:
         """Return the (D,) action to execute, clipped to the spec."""
-        seen = {key: torch.from_numpy(value[None]) for key, value in arrays(observation, self._spec).items()}
-        action = self._after(self._policy.select_action(self._before({**seen, TASK: [observation.instruction]})))
+        batch = {key: torch.from_numpy(value[None]) for key, value in arrays(observation, self._spec).items()}
+        action = self._after(self._policy.select_action(self._before({**batch, TASK: [observation.instruction]})))
         return np.clip(action[0].float().cpu().numpy(), self._low, self._high).astype(np.float32)
 
 
 def _require(config: PreTrainedConfig, spec: Spec, folder: str) -> None:
     """Raise a ValueError unless the environment gives all that the policy sees, and takes its actions."""
-    given = arrays(spec.random_observation(np.random.default_rng(0)), spec)
-    there = {key: (*value.shape,) for key, value in given.items()} | {ACTION: (len(spec.action),)}
-    wanted = {key: (*part.shape,) for key, part in {**config.input_features, **config.output_features}.items()}
-    if other := [
-        f"{key} {shape}, the task {there.get(key, 'none')}" for key, shape in wanted.items() if shape != there.get(key)
+    inputs = arrays(spec.random_observation(np.random.default_rng(0)), spec)
+    sizes = {key: (*value.shape,) for key, value in inputs.items()} | {ACTION: (len(spec.action),)}
+    layout = {key: (*part.shape,) for key, part in {**config.input_features, **config.output_features}.items()}
+    if misfits := [
+        f"{key} {shape}, the task {sizes.get(key, 'none')}" for key, shape in layout.items() if shape != sizes.get(key)
     ]:
-        raise UserError(f"the policy in {folder} does not fit the task: it has {'; '.join(other)}")
+        raise UserError(f"the policy in {folder} does not fit the task: it has {'; '.join(misfits)}")

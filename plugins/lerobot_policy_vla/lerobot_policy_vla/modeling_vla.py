@@ -86,17 +86,17 @@ class VlaPolicy(PreTrainedPolicy):
         """Raise: the policy is not trained here."""
         raise NotImplementedError("policies of vla are trained with python -m vla.run")
 
-    def _ask(self, batch: dict[str, Any], question: Any) -> Tensor:
+    def _ask(self, batch: dict[str, Any], method: Any) -> Tensor:
         arrays: dict[str, Any] = {
             key: value.float().cpu().numpy() for key, value in batch.items() if isinstance(value, Tensor)
         }
-        said = {TASK: batch[TASK]} if TASK in batch else {}
-        seen = observations({**arrays, **said}, self._policy.spec)
-        lanes = range(len(seen))
-        if self._lanes != len(seen):
-            self._lanes = len(seen)
+        task = {TASK: batch[TASK]} if TASK in batch else {}
+        inputs = observations({**arrays, **task}, self._policy.spec)
+        lanes = range(len(inputs))
+        if self._lanes != len(inputs):
+            self._lanes = len(inputs)
             for lane in lanes:
-                self._policy.reset(seen[lane].instruction, lane, lane)
-        answers: Array = question(seen, lanes)
+                self._policy.reset(inputs[lane].instruction, lane, lane)
+        answers: Array = method(inputs, lanes)
         answers *= np.array(self.config.scale or 1, np.float32)
         return torch.from_numpy(answers).to(self._policy.device)

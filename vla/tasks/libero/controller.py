@@ -27,9 +27,9 @@ class Controller:
     def __init__(self, model: mujoco.MjModel) -> None:
         """Args: the model of a scene."""
         self._model = model
-        first = model.joint("robot0_joint1")  # of seven in a row
-        self._qpos = slice(first.qposadr[0], first.qposadr[0] + 7)
-        self._arm = slice(first.dofadr[0], first.dofadr[0] + 7)
+        joint = model.joint("robot0_joint1")  # of seven in a row
+        self._qpos = slice(joint.qposadr[0], joint.qposadr[0] + 7)
+        self._arm = slice(joint.dofadr[0], joint.dofadr[0] + 7)
         self.site = model.site("gripper0_grip_site").id
         self._motors = np.array([model.actuator(f"robot0_torq_j{number}").id for number in range(1, 8)])
         self._fingers = np.array([model.actuator(f"gripper0_gripper_finger_joint{n}").id for n in (1, 2)])
@@ -48,7 +48,7 @@ class Controller:
         LIBERO's controller does not notice that an initial state replaces the home posture: the first goal is relative
         to the hand in that posture, the first torque is computed there, and its rotation is held until an action turns.
         """
-        self._turned = self._home.site_xmat[self.site].reshape(3, 3).copy()
+        self._rotation_goal = self._home.site_xmat[self.site].reshape(3, 3).copy()
         self._goal = self._home.site_xpos[self.site].copy()
         self.opening = 0.0  # commanded, 1 open and -1 closed: LIBERO starts half open
         self._unnoticed = True
@@ -58,12 +58,12 @@ class Controller:
         move = np.clip(action[:6], -1, 1) * REACH
         for substep in range(SUBSTEPS):
             mujoco.mj_step1(self._model, data)
-            seen = self._home if self._unnoticed else data
+            state = self._home if self._unnoticed else data
             if substep == 0:
-                self._goal = seen.site_xpos[self.site] + move[:3]
+                self._goal = state.site_xpos[self.site] + move[:3]
                 if move[3:].any():
-                    self._turned = rotation(move[3:]) @ seen.site_xmat[self.site].reshape(3, 3)
-            torques = self._torques(seen) + data.qfrc_bias[self._arm]
+                    self._rotation_goal = rotation(move[3:]) @ state.site_xmat[self.site].reshape(3, 3)
+            torques = self._torques(state) + data.qfrc_bias[self._arm]
             self._unnoticed = False
             data.ctrl[self._motors] = np.clip(torques, self._low, self._high)
             self.opening = float(np.clip(self.opening - GRIPPER_RATE * np.sign(action[6]), -1, 1))
@@ -76,15 +76,15 @@ class Controller:
         mujoco.mj_jacSite(self._model, data, self._jacobian[:3], self._jacobian[3:], self.site)
         mujoco.mj_fullM(self._model, data, self._mass)
         jacobian, mass = self._jacobian[:, arm], self._mass[arm, arm]
-        here = data.site_xmat[self.site].reshape(3, 3)
+        orientation = data.site_xmat[self.site].reshape(3, 3)
         error = np.empty(6)
         error[:3] = self._goal - data.site_xpos[self.site]
-        error[3:] = 0.5 * np.cross(here, self._turned, axis=0).sum(axis=1)
-        wanted = STIFFNESS * error - DAMPING * (jacobian @ data.qvel[arm])
+        error[3:] = 0.5 * np.cross(orientation, self._rotation_goal, axis=0).sum(axis=1)
+        acceleration = STIFFNESS * error - DAMPING * (jacobian @ data.qvel[arm])
         compliance = jacobian @ np.linalg.solve(mass, jacobian.T)  # (6, 6), inverse of the hand's inertia
         force = np.empty(6)  # position and rotation each by its own block, as robosuite's `uncouple_pos_ori`
-        force[:3] = np.linalg.solve(compliance[:3, :3], wanted[:3])
-        force[3:] = np.linalg.solve(compliance[3:, 3:], wanted[3:])
+        force[:3] = np.linalg.solve(compliance[:3, :3], acceleration[:3])
+        force[3:] = np.linalg.solve(compliance[3:, 3:], acceleration[3:])
         posture = POSTURE * (HOME - data.qpos[self._qpos]) - POSTURE_DAMPING * data.qvel[arm]
         force -= np.linalg.solve(compliance, jacobian @ posture)  # the posture must not move the hand
         return jacobian.T @ force + mass @ posture

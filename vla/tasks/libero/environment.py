@@ -80,11 +80,11 @@ class Libero(ManyTasks):
         """
         super().__init__()
         folders()  # raise now, because an evaluation attributes an error in `reset` to that episode
-        chosen = range(10) if tasks is None else tasks
+        numbers = range(10) if tasks is None else tasks
         suites = dict.fromkeys(
-            name for each in ([suite] if isinstance(suite, str) else suite) for name in suites_of(each)
+            name for group in ([suite] if isinstance(suite, str) else suite) for name in suites_of(group)
         )
-        self._tasks = [tasks_of(name)[number] for name in suites for number in chosen]
+        self._tasks = [tasks_of(name)[number] for name in suites for number in numbers]
         self.tasks = tuple(task.name for task in self._tasks)
         self._limits, self._settle, self._mirror = STEPS[steps], settle, mirror
         self._randomize, self._renderer, self._detail = randomize, renderer, detail
@@ -103,8 +103,8 @@ class Libero(ManyTasks):
 
     def distinct(self, seeds: range) -> int:
         """Return the number of distinct episodes of seeds: each task has only `STATES` official states."""
-        official = range(max(seeds.start, FIRST_SEED), min(seeds.stop, END))
-        return len(seeds) - max(0, len(official) - STATES * len(self._tasks))
+        official_seeds = range(max(seeds.start, FIRST_SEED), min(seeds.stop, END))
+        return len(seeds) - max(0, len(official_seeds) - STATES * len(self._tasks))
 
     @property
     def tool(self) -> Array:
@@ -115,7 +115,7 @@ class Libero(ManyTasks):
         """Start the episode of `seed`."""
         number = seed % len(self._tasks)
         task = self._task = self._tasks[number]
-        self.task, self.done, self.outcome, self._taken = task.name, False, "timeout", 0
+        self.task, self.done, self.outcome, self._steps_taken = task.name, False, "timeout", 0
         scene = self._scene = self._scene_of(task.scene, lambda: Scene(task, self._renderer, self.spec, self._detail))
         starts, self._goal = scene.started(task)
         state = (seed - FIRST_SEED) // len(self._tasks) % STATES if FIRST_SEED <= seed < END else None
@@ -138,19 +138,19 @@ class Libero(ManyTasks):
         """Apply one (7,) action, clipped to the spec's bounds, for one control period."""
         self._require_running()
         self._scene.controller.step(self._scene.data, command_of(np.clip(action, self.spec.low, self.spec.high)))
-        self._taken += 1
+        self._steps_taken += 1
         if self._goal.reached(self._scene.data):
             self.outcome = "success"
-        self.done = self.outcome == "success" or self._taken == self._limits[self._task.suite.partition("_")[0]]
+        self.done = self.outcome == "success" or self._steps_taken == self._limits[self._task.suite.partition("_")[0]]
         return self._look()
 
     def _look(self) -> Observation:
         scene = self._scene
         pictures = () if self._blind else scene.pictures(self._mirror)
-        following = (*self._goal.todo(scene.data), *self._goal.parts)[0]  # what is to be done next
+        subgoal = (*self._goal.todo(scene.data), *self._goal.parts)[0]  # what is to be done next
         truth = {
-            "object": scene.position(following.thing),
-            "goal": scene.position(following.place or following.thing),
+            "object": scene.position(subgoal.thing),
+            "goal": scene.position(subgoal.place or subgoal.thing),
             "reach": self.tool - scene.base,  # the surface that things stand on is at the height of the base
             "task": np.array([ALL.index(self._task.suite), self._task.number]),
             "positions": scene.data.qpos.copy(),
@@ -176,11 +176,11 @@ class Scene:
         """
         self.model = model = load_scene(task.scene, _things(task), detail)
         self.data = mujoco.MjData(model)
-        self._started: dict[str, tuple[Starts, Goal]] = {}
+        self._starts: dict[str, tuple[Starts, Goal]] = {}
         self.controller = Controller(model)
-        known = [model.camera(number).name for number in range(model.ncam)]
-        if unknown := [name for name in spec.cameras if name not in known]:
-            raise UserError(f"task.cameras names {', '.join(unknown)}; LIBERO has {', '.join(known)}")
+        camera_names = [model.camera(number).name for number in range(model.ncam)]
+        if unknown_cameras := [name for name in spec.cameras if name not in camera_names]:
+            raise UserError(f"task.cameras names {', '.join(unknown_cameras)}; LIBERO has {', '.join(camera_names)}")
         model.mat_reflectance[:] = 0  # no renderer draws reflections
         self._burners = [n for n in range(model.nsite) if model.site(n).name.endswith(BURNER)]
         self._knobs = [
@@ -189,19 +189,19 @@ class Scene:
         ]
         model.site_rgba[:, 3] = 0  # sites only mark regions
         self._colours, self._materials = model.mat_rgba.copy(), _materials(model, task)
-        cameras = [known.index(name) for name in spec.cameras]
+        cameras = [camera_names.index(name) for name in spec.cameras]
         views = Views(cameras, *spec.image_size, geom_groups=(VISIBLE,), site_groups=tuple(range(6)))
         self._renderer = LazyRenderer(renderer, model, views)
         self.base = model.body("robot0_base").pos.copy()  # of the arm (3,) [m]
         self._hand = model.body("robot0_right_hand").id
-        first = model.joint("gripper0_finger_joint1").qposadr[0]
-        self._fingers = slice(first, first + 2)
+        address = model.joint("gripper0_finger_joint1").qposadr[0]
+        self._fingers = slice(address, address + 2)
 
     def started(self, task: Task) -> tuple[Starts, Goal]:
         """Return starts and goal of one of the tasks in this scene."""
-        if task.name not in self._started:
-            self._started[task.name] = Starts(self.model, task), Goal(self.model, task.goal)
-        return self._started[task.name]
+        if task.name not in self._starts:
+            self._starts[task.name] = Starts(self.model, task), Goal(self.model, task.goal)
+        return self._starts[task.name]
 
     def colour(self, random: np.random.Generator | None) -> None:
         """Tint about half of the things; None: give all their own colours."""
@@ -214,12 +214,12 @@ class Scene:
 
     def position(self, thing: str) -> Array:
         """Return the position (3,) of a thing or region in the world [m]."""
-        found = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, f"{thing}_main")
-        return (self.data.xpos[found] if found >= 0 else self.data.site(thing).xpos).copy()
+        body = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, f"{thing}_main")
+        return (self.data.xpos[body] if body >= 0 else self.data.site(thing).xpos).copy()
 
     def fixtures(self, task: Task) -> Array:
         """Return position [m] and quaternion wxyz of the bodies of all fixtures (F, 7), in the order of the task."""
-        bodies = [self.model.body(one["body"]) for one in task.fixtures.values()]
+        bodies = [self.model.body(fixture["body"]) for fixture in task.fixtures.values()]
         return np.array([[*body.pos, *body.quat] for body in bodies]).reshape(-1, 7)
 
     def state(self) -> Array:
@@ -235,11 +235,11 @@ class Scene:
     def pictures(self, mirror: bool) -> Array:
         """Draw every camera's picture (cameras, H, W, 3) uint8."""
         for burner, knob in zip(self._burners, self._knobs, strict=True):
-            glows = float(self.data.qpos[knob] >= 0.5)
-            self._renderer.changed |= bool(self.model.site_rgba[burner, 3] != glows)
-            self.model.site_rgba[burner, 3] = glows
-        drawn = self._renderer.render(self.data)[0]
-        return drawn[:, :, ::-1] if mirror else drawn
+            glow = float(self.data.qpos[knob] >= 0.5)
+            self._renderer.changed |= bool(self.model.site_rgba[burner, 3] != glow)
+            self.model.site_rgba[burner, 3] = glow
+        pictures = self._renderer.render(self.data)[0]
+        return pictures[:, :, ::-1] if mirror else pictures
 
     def close(self) -> None:
         """Free the renderer."""
@@ -248,10 +248,10 @@ class Scene:
 
 def _materials(model: mujoco.MjModel, task: Task) -> list[list[int]]:
     """Return the materials of each movable thing and fixture."""
-    bodies = [f"{thing}_main" for thing in sorted(_things(task))] + [one["body"] for one in task.fixtures.values()]
+    bodies = [f"{thing}_main" for thing in sorted(_things(task))] + [entry["body"] for entry in task.fixtures.values()]
     roots = model.body_rootid[model.geom_bodyid]
-    found = [set(model.geom_matid[roots == model.body_rootid[model.body(name).id]].tolist()) for name in bodies]
-    return [sorted(materials - {-1}) for materials in found]
+    groups = [set(model.geom_matid[roots == model.body_rootid[model.body(name).id]].tolist()) for name in bodies]
+    return [sorted(materials - {-1}) for materials in groups]
 
 
 def _things(task: Task) -> set[str]:

@@ -66,18 +66,18 @@ class Planner:
 
 def decide(at: Situation) -> Array:
     """Return the command (7,) for a state."""
-    todo, touched = at.goal.todo(at.data), at.touched()
-    held = touched if at.opening < HELD and at.gap > THIN else None
+    todo, touched_thing = at.goal.todo(at.data), at.touched()
+    held_thing = touched_thing if at.opening < HELD and at.gap > THIN else None
     if not todo:
         return _open_fingers(at)
-    if touched is not None and all(at.subject(part.thing) != touched for part in todo):
-        return _release(at, held)
-    name, thing, place = next((part for part in todo if part.thing == held), todo[0])
-    if name in ("on", "in") and _shut(at, place, SLIPPED if thing == held else 0.0):
-        if thing == held:  # the hand is needed to open the drawer
+    if touched_thing is not None and all(at.subject(part.thing) != touched_thing for part in todo):
+        return _release(at, held_thing)
+    name, thing, place = next((part for part in todo if part.thing == held_thing), todo[0])
+    if name in ("on", "in") and _is_shut(at, place, SLIPPED if thing == held_thing else 0.0):
+        if thing == held_thing:  # the hand is needed to open the drawer
             return _open_fingers(at)
-        aside = in_the_way(at, thing, int(at.goal.joints(place)[0]))
-        return pull(at, place) if aside is None or not at.upright else drag(at, thing, aside)
+        displacement = in_the_way(at, thing, int(at.goal.joints(place)[0]))
+        return pull(at, place) if displacement is None or not at.upright else drag(at, thing, displacement)
     if name == "open":
         return pull(at, thing)
     if not at.upright:
@@ -86,26 +86,26 @@ def decide(at: Situation) -> Array:
         return twist(at, thing, TWIST if name == "turnon" else -TWIST)
     if name == "close":
         return push(at, thing)
-    return _deliver(at, thing, place, thing == held)
+    return _deliver(at, thing, place, thing == held_thing)
 
 
 def _open_fingers(at: Situation) -> Array:
     return command(at, at.hand, at.yaw, -1.0, at.lean)
 
 
-def _release(at: Situation, held: str | None) -> Array:
+def _release(at: Situation, thing: str | None) -> Array:
     """Let go of a thing that needs nothing more, once it lies where the goal requires it."""
-    done = next((part for part in at.goal.parts if part.thing == held), None)
-    if done is not None and done.name == "in" and at.subject(done.place).startswith(HOLLOWS):
-        place = place_of(at, done.thing, done.place, True)
-        if np.linalg.norm(place.spot - at.origin(done.thing)) > ARRIVED:
-            return carry(at, done.thing, place)  # it counts as there, but it is not down or not far enough in yet
-    return let_go(at, done.thing) if done is not None and done.name == "on" else _open_fingers(at)
+    predicate = next((part for part in at.goal.parts if part.thing == thing), None)
+    if predicate is not None and predicate.name == "in" and at.subject(predicate.place).startswith(HOLLOWS):
+        place = place_of(at, predicate.thing, predicate.place, True)
+        if np.linalg.norm(place.spot - at.origin(predicate.thing)) > ARRIVED:
+            return carry(at, predicate.thing, place)  # it counts as there, but it is not down or not far enough in yet
+    return let_go(at, predicate.thing) if predicate is not None and predicate.name == "on" else _open_fingers(at)
 
 
-def _deliver(at: Situation, thing: str, where: str, held: bool) -> Array:
+def _deliver(at: Situation, thing: str, destination: str, held: bool) -> Array:
     """Bring a thing to where it is to be."""
-    place = place_of(at, thing, where, held)
+    place = place_of(at, thing, destination, held)
     if held:
         return carry(at, thing, place)
     grasp = choose_grasp(at, thing, place)
@@ -116,7 +116,7 @@ def _deliver(at: Situation, thing: str, where: str, held: bool) -> Array:
     return approach(at, grasp, at.points(thing), thing)
 
 
-def _shut(at: Situation, place: str, slack: float) -> bool:
+def _is_shut(at: Situation, place: str, slack: float) -> bool:
     """Return whether a place is in a drawer that must be opened first; it may lack `slack` [m] of being open."""
     if place in at.goal.bodies or not at.subject(place).startswith(DRAWERS):
         return False

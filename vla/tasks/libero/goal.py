@@ -44,8 +44,8 @@ class Goal:
         self.sites = {model.site(number).name: number for number in range(model.nsite)}
         self.owner = np.zeros(model.nbody, int)  # body → body of the thing that it is part of, 0: of none
         for number in range(1, model.nbody):
-            own = names[number].endswith("_main")
-            self.owner[number] = number if own else self.owner[model.body_parentid[number]]
+            is_main = names[number].endswith("_main")
+            self.owner[number] = number if is_main else self.owner[model.body_parentid[number]]
 
     def reached(self, data: mujoco.MjData) -> bool:
         """Return whether all predicates hold."""
@@ -58,16 +58,16 @@ class Goal:
     def holds(self, data: mujoco.MjData, predicate: str, thing: str, place: str = "") -> bool:
         """Return whether one predicate holds."""
         if predicate == "on":
-            return self._on(data, self.bodies[thing], place)
+            return self._is_on(data, self.bodies[thing], place)
         if predicate == "in":
-            return self._in(data, self.bodies[thing], place)
+            return self._is_in(data, self.bodies[thing], place)
         turns = data.qpos[self._model.jnt_qposadr[self.joints(thing)]]
         if predicate == "turnon":
             return bool((turns >= STOVE_ON).any())
         if predicate == "turnoff":
             return bool((turns < STOVE_OFF).all())
-        opened, closed = next(limits for name, limits in DOORS.items() if thing.startswith(name))
-        return bool((turns < opened).any() if predicate == "open" else (turns > closed).all())
+        open_limit, closed_limit = next(limits for name, limits in DOORS.items() if thing.startswith(name))
+        return bool((turns < open_limit).any() if predicate == "open" else (turns > closed_limit).all())
 
     def joints(self, thing: str) -> Array:
         """Return the joints of a fixture, or of the one body, such as a drawer, that a region belongs to."""
@@ -76,7 +76,7 @@ class Goal:
             return np.flatnonzero(self.owner[bodies] == self.bodies[thing])
         return np.flatnonzero(bodies == self._model.site_bodyid[self.sites[thing]])
 
-    def _on(self, data: mujoco.MjData, body: int, place: str) -> bool:
+    def _is_on(self, data: mujoco.MjData, body: int, place: str) -> bool:
         if place in self.bodies:
             support = self.bodies[place]
             gap = data.xpos[body] - data.xpos[support]
@@ -85,11 +85,11 @@ class Goal:
         size = self._model.site_size[site]
         # Like LIBERO, which multiplies by the site's matrix where its transpose was meant.
         gap = data.site_xmat[site].reshape(3, 3) @ (data.xpos[body] - data.site_xpos[site])
-        over = size[2] + OVER[0] < gap[2] < size[2] + OVER[1] and bool((np.abs(gap[:2]) < size[:2]).all())
+        is_over = size[2] + OVER[0] < gap[2] < size[2] + OVER[1] and bool((np.abs(gap[:2]) < size[:2]).all())
         owner = self.owner[self._model.site_bodyid[site]]  # 0: a part of the table, which needs no touch
-        return over and (owner == 0 or self.touch(data, body, owner))
+        return is_over and (owner == 0 or self.touch(data, body, owner))
 
-    def _in(self, data: mujoco.MjData, body: int, place: str) -> bool:
+    def _is_in(self, data: mujoco.MjData, body: int, place: str) -> bool:
         """Return whether the body's origin is in the region, even if the gripper holds it."""
         site = self.sites[place]
         size = np.abs(data.site_xmat[site].reshape(3, 3) @ self._model.site_size[site])

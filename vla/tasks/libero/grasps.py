@@ -39,51 +39,51 @@ class Grasp:
 def choose_grasp(at: Situation, thing: str, place: Place) -> Grasp | None:
     """Return the cheapest grasp from above of a thing to be brought to a place; None if there is none."""
     points = at.points(thing)
-    tilted = np.abs(at.data.xmat[at.goal.bodies[thing], 6:]).max() < UPRIGHT  # whichever of its axes is up
-    kinds = (crest(points),) if tilted else (across(points), walls(points), parts(at.pieces(thing)), leaning(points))
-    best: Grasp | None = None
-    lowest_cost = hindered = math.inf  # cost of the best one, and the part of it that is due to its kind and obstacles
-    for least, kind in zip(KINDS, kinds, strict=False):
-        if hindered < least:
+    is_tilted = np.abs(at.data.xmat[at.goal.bodies[thing], 6:]).max() < UPRIGHT  # whichever of its axes is up
+    kinds = (crest(points),) if is_tilted else (across(points), walls(points), parts(at.pieces(thing)), leaning(points))
+    best_grasp: Grasp | None = None
+    lowest_cost = hindrance = math.inf  # cost of the best one, and the part of it that is due to its kind and obstacles
+    for base_cost, kind in zip(KINDS, kinds, strict=False):
+        if hindrance < base_cost:
             break  # its obstacles cost less than another kind of grasp
-        if not (fitting := [(width, grasp) for width, grasp in kind if gap_of(grasp, points) > 0]):
+        if not (candidates := [(width, grasp) for width, grasp in kind if gap_of(grasp, points) > 0]):
             continue
-        widths, grasps = zip(*fitting, strict=True)
+        widths, grasps = zip(*candidates, strict=True)
         moves, hindrances = _costs(at, thing, grasps, place)
-        costs = least + np.array(widths) + moves + hindrances
-        cheapest = int(np.argmin(costs))
-        if costs[cheapest] < lowest_cost:
-            best, lowest_cost = grasps[cheapest], float(costs[cheapest])
-            hindered = float(least + hindrances[cheapest])
-    return best
+        costs = base_cost + np.array(widths) + moves + hindrances
+        index = int(np.argmin(costs))
+        if costs[index] < lowest_cost:
+            best_grasp, lowest_cost = grasps[index], float(costs[index])
+            hindrance = float(base_cost + hindrances[index])
+    return best_grasp
 
 
 def room_of(at: Situation, thing: str, grasp: Grasp) -> float:
     """Return the free room about the hand at a grasp [m]."""
-    others = at.others(thing, grasp.position, 2 * HAND)
-    return float(clearance(grasp.position[None], np.array([grasp.yaw]), others, np.array([grasp.lean]))[0])
+    obstacles = at.others(thing, grasp.position, 2 * HAND)
+    return float(clearance(grasp.position[None], np.array([grasp.yaw]), obstacles, np.array([grasp.lean]))[0])
 
 
 def _costs(at: Situation, thing: str, grasps: Sequence[Grasp], place: Place) -> tuple[Array, Array]:
     """Return costs (K,) of the motion of the hand, and of what hinders it where it grasps and where it lets go."""
-    here = np.array([grasp.position for grasp in grasps])
+    spots = np.array([grasp.position for grasp in grasps])
     yaws, leans = np.array([grasp.yaw for grasp in grasps]), np.array([grasp.lean for grasp in grasps])
-    there = place.spot + (here - at.origin(thing)) @ rotation_z(place.turn).T
+    targets = place.spot + (spots - at.origin(thing)) @ rotation_z(place.turn).T
     turns = np.array([at.turn_to(yaw) for yaw in yaws])
     # What is near the hand costs less: the choice stays the same while the hand approaches.
-    near = np.minimum(np.linalg.norm(here[:, :2] - at.hand[:2], axis=1), HAND)
-    moves = 0.02 * np.abs(turns) + 0.02 * np.abs(leans - at.lean) + 0.5 * near + 0.01 * np.abs(yaws)
-    there = _hindrances(at, thing, there, yaws + place.turn, leans)
+    distance = np.minimum(np.linalg.norm(spots[:, :2] - at.hand[:2], axis=1), HAND)
+    moves = 0.02 * np.abs(turns) + 0.02 * np.abs(leans - at.lean) + 0.5 * distance + 0.01 * np.abs(yaws)
+    releases = _hindrances(at, thing, targets, yaws + place.turn, leans)
     if place.out is None:
-        there -= there.min()  # a basket's walls are close to every hand, and things may fall the last centimetres
-    return moves, _hindrances(at, thing, here, yaws, leans) + there
+        releases -= releases.min()  # a basket's walls are close to every hand, and things may fall the last centimetres
+    return moves, _hindrances(at, thing, spots, yaws, leans) + releases
 
 
 def _hindrances(at: Situation, thing: str, spots: Array, yaws: Array, leans: Array) -> Array:
     """Return costs (K,) of obstacles close to the hand at places (K, 3) [m], and of reaching these places."""
     middle = (spots.max(axis=0) + spots.min(axis=0)) / 2
-    others = at.others(thing, middle, float(np.ptp(spots[:, :2], axis=0).max()) / 2 + HAND + CLEAR)
-    gaps = clearance(spots, yaws, others, leans)
+    obstacles = at.others(thing, middle, float(np.ptp(spots[:, :2], axis=0).max()) / 2 + HAND + CLEAR)
+    gaps = clearance(spots, yaws, obstacles, leans)
     return 3 * np.maximum(0, CLEAR - gaps) + 10 * np.maximum(0, TOUCHING - gaps) + far(at, spots)
 
 
@@ -94,11 +94,11 @@ def across(points: Array) -> Iterator[tuple[float, Grasp]]:
     ring = points[np.abs(points[:, 2] - height) < 0.012]
     ring = points if len(ring) < 8 else ring
     for yaw in YAWS:
-        closing, along = axes(yaw)
-        wide, length = ring[:, :2] @ closing, ring[:, :2] @ along
-        if np.ptp(wide) <= WIDEST:
-            middle = closing * (wide.max() + wide.min()) / 2 + along * (length.max() + length.min()) / 2
-            yield float(np.ptp(wide)), Grasp(np.array([*middle, height]), float(yaw))
+        closing, cross_axis = axes(yaw)
+        widths, lengths = ring[:, :2] @ closing, ring[:, :2] @ cross_axis
+        if np.ptp(widths) <= WIDEST:
+            middle = closing * (widths.max() + widths.min()) / 2 + cross_axis * (lengths.max() + lengths.min()) / 2
+            yield float(np.ptp(widths)), Grasp(np.array([*middle, height]), float(yaw))
 
 
 def crest(points: Array) -> Iterator[tuple[float, Grasp]]:
@@ -113,12 +113,12 @@ def crest(points: Array) -> Iterator[tuple[float, Grasp]]:
 
 def walls(points: Array) -> Iterator[tuple[float, Grasp]]:
     """Yield width [m] and grasp of the wall of a hollow thing, at its edge."""
-    upper = points[points[:, 2] > (points[:, 2].max() + points[:, 2].min()) / 2]
+    upper_points = points[points[:, 2] > (points[:, 2].max() + points[:, 2].min()) / 2]
     middle = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
     for yaw in YAWS:
         closing, _ = axes(yaw)
         for side in (1, -1):
-            spot = upper[np.argmax(upper[:, :2] @ (side * closing)), :2]
+            spot = upper_points[np.argmax(upper_points[:, :2] @ (side * closing)), :2]
             outwards = spot - middle
             if side * (outwards @ closing) < SQUARE * np.linalg.norm(outwards):
                 continue  # the wall is oblique, as that of a tilted bowl
@@ -139,26 +139,26 @@ def parts(pieces: Sequence[Array], alone: bool = True) -> Iterator[tuple[float, 
 
     `alone`: nothing else of the thing may be between the fingers.
     """
-    whole = np.concatenate(pieces)
-    top = whole[:, 2].max()
+    cloud = np.concatenate(pieces)
+    top = cloud[:, 2].max()
     for points in pieces:
         height = max(points[:, 2].max() - 0.02, points[:, 2].min() + TIP, top - PALM)
         if height > points[:, 2].max() - 0.004:
             continue
         middle = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
         for yaw in YAWS:
-            closing, along = axes(yaw)
+            closing, cross_axis = axes(yaw)
             width = float(np.ptp(points[:, :2] @ closing))
-            band = whole[(np.abs((whole[:, :2] - middle) @ along) < FINGER) & (whole[:, 2] > height - TIP)]
-            aside = np.abs((band[:, :2] - middle) @ closing)
-            if width < WIDEST / 2 and not (alone and aside[aside < OPEN].max(initial=0.0) > width / 2 + THIN):
+            band = cloud[(np.abs((cloud[:, :2] - middle) @ cross_axis) < FINGER) & (cloud[:, 2] > height - TIP)]
+            offsets = np.abs((band[:, :2] - middle) @ closing)
+            if width < WIDEST / 2 and not (alone and offsets[offsets < OPEN].max(initial=0.0) > width / 2 + THIN):
                 yield width, Grasp(np.array([*middle, height]), float(yaw))
 
 
 def gap_of(grasp: Grasp, points: Array) -> float:
     """Return the gap between the open fingers that come down and the thing [m]; negative: they come down on it."""
-    closing, along = axes(grasp.yaw)
+    closing, cross_axis = axes(grasp.yaw)
     offset = points[:, :2] - grasp.position[:2]
-    near = (np.abs(offset @ along) < FINGER) & (points[:, 2] > grasp.position[2] - TIP)
-    aside = np.abs(offset[near] @ closing)
-    return float(np.maximum(OPEN - aside, aside - OPEN - THICK).min(initial=np.inf))
+    mask = (np.abs(offset @ cross_axis) < FINGER) & (points[:, 2] > grasp.position[2] - TIP)
+    distances = np.abs(offset[mask] @ closing)
+    return float(np.maximum(OPEN - distances, distances - OPEN - THICK).min(initial=np.inf))

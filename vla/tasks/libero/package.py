@@ -69,13 +69,13 @@ def folders() -> dict[str, Path]:
     Raises:
         UserError: a wheel is missing or has another version.
     """
-    for name, wanted in WHEELS.items():
+    for name, expected_version in WHEELS.items():
         try:
-            found = version(name)
+            found_version = version(name)
         except PackageNotFoundError:
             raise UserError(f"task=libero needs files of the wheel {name}, which is not installed: {INSTALL}") from None
-        if found != wanted:
-            raise UserError(f"task=libero needs {name} {wanted}, and {found} is installed: {INSTALL}")
+        if found_version != expected_version:
+            raise UserError(f"task=libero needs {name} {expected_version}, and {found_version} is installed: {INSTALL}")
     places = {}
     for prefix, folder in FOLDERS.items():
         package, *parts = folder.split("/")
@@ -106,16 +106,16 @@ def tasks_of(suite: str) -> tuple[Task, ...]:
     Raises:
         UserError: there is no such suite.
     """
-    known = json.loads(_archive()["tasks.json"])
+    suites = json.loads(_archive()["tasks.json"])
     kind, _, change = suite.partition("_")
     if kind not in SUITES or (change and change not in CHANGES):
         raise UserError(
             f"LIBERO has no suite {suite!r}: it has {', '.join(SUITES)}, and LIBERO-PRO each of them with "
             f"{', '.join('_' + name for name in CHANGES)}"
         )
-    entries = known[f"libero_{'10' if kind == 'long' else kind}{'_' + change if change else ''}"]
-    numbered = [{**entry, "suite": suite, "number": number} for number, entry in enumerate(entries)]
-    return parse_plain(numbered, tuple[Task, ...], str(SCENES))
+    entries = suites[f"libero_{'10' if kind == 'long' else kind}{'_' + change if change else ''}"]
+    tasks = [{**entry, "suite": suite, "number": number} for number, entry in enumerate(entries)]
+    return parse_plain(tasks, tuple[Task, ...], str(SCENES))
 
 
 def scene_xml(name: str) -> str:

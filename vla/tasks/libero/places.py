@@ -42,23 +42,23 @@ class Place:
 def place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
     """Return where to put a thing down on another one, or on or in a region; `held`: whether the hand holds it."""
     place = _place_of(at, thing, where, held)
-    before = at.origin(thing) - place.spot
-    entering = place.out is not None and np.linalg.norm(before) < np.linalg.norm(place.out) + 0.03
+    offset = at.origin(thing) - place.spot
+    entering = place.out is not None and np.linalg.norm(offset) < np.linalg.norm(place.out) + 0.03
     return place if entering else replace(place, hidden=_hidden(at, thing, held))
 
 
 def _hidden(at: Situation, thing: str, held: bool) -> Array | None:
     """Return the displacement (3,) [m] of a thing to where nothing is over it; None: nothing is, or it is blocked."""
-    rest = at.others(thing, at.origin(thing), 0.3)
-    return way_out(at, thing, rest[rest[:, 2] > at.points(thing)[:, 2].max()], held)
+    obstacles = at.others(thing, at.origin(thing), 0.3)
+    return way_out(at, thing, obstacles[obstacles[:, 2] > at.points(thing)[:, 2].max()], held)
 
 
 def in_the_way(at: Situation, thing: str, joint: int) -> Array | None:
     """Return the displacement (3,) [m] of a thing out of a drawer's way; None: it is not in the way, or blocked."""
-    moving = np.concatenate(at.moving(joint))
-    opening = np.linspace(0, at.model.jnt_range[joint, 0] - at.data.qpos[at.model.jnt_qposadr[joint]], 5)
-    rest = np.concatenate([moving + far * at.data.xaxis[joint] for far in opening])
-    return way_out(at, thing, rest[rest[:, 2] > at.points(thing)[:, 2].max()], False, ASIDE)
+    drawer = np.concatenate(at.moving(joint))
+    distances = np.linspace(0, at.model.jnt_range[joint, 0] - at.data.qpos[at.model.jnt_qposadr[joint]], 5)
+    path = np.concatenate([drawer + distance * at.data.xaxis[joint] for distance in distances])
+    return way_out(at, thing, path[path[:, 2] > at.points(thing)[:, 2].max()], False, ASIDE)
 
 
 def way_out(at: Situation, thing: str, over: Array, held: bool, margin: float = 2 * MARGIN) -> Array | None:
@@ -68,7 +68,7 @@ def way_out(at: Situation, thing: str, over: Array, held: bool, margin: float = 
     if not form.room(origin[None], over)[1][0]:
         return None
     starts = np.column_stack([origin[:2] + 0.02 * WAYS, np.full(len(WAYS), points[:, 2].max() - 0.02)])
-    gaps = clearance(starts, np.arctan2(WAYS[:, 1], WAYS[:, 0]), _flat(over))
+    gaps = clearance(starts, np.arctan2(WAYS[:, 1], WAYS[:, 0]), _thin(over))
     obstacles = at.others(thing, origin, 0.3)
     obstacles = obstacles[obstacles[:, 2] > points[:, 2].min() + FLOOR]
     if held:
@@ -76,18 +76,18 @@ def way_out(at: Situation, thing: str, over: Array, held: bool, margin: float = 
     return form.out(origin, obstacles, 3 * np.maximum(0, CLEAR - gaps), over, margin, PUSHED)
 
 
-def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
+def _place_of(at: Situation, thing: str, destination: str, held: bool) -> Place:
     points, origin = at.points(thing), at.origin(thing)
-    below = origin[2] - points[:, 2].min()
-    if where in at.goal.bodies:
-        support, middle = at.points(where), at.origin(where)
-        near = support[np.linalg.norm(support[:, :2] - middle[:2], axis=1) < 0.03]
-        return Place(np.array([*middle[:2], (near if len(near) else support)[:, 2].max() + below + 0.004]))
-    site = at.goal.sites[where]
+    foot = origin[2] - points[:, 2].min()
+    if destination in at.goal.bodies:
+        support, middle = at.points(destination), at.origin(destination)
+        core = support[np.linalg.norm(support[:, :2] - middle[:2], axis=1) < 0.03]
+        return Place(np.array([*middle[:2], (core if len(core) else support)[:, 2].max() + foot + 0.004]))
+    site = at.goal.sites[destination]
     middle, axes = at.data.site_xpos[site], at.data.site_xmat[site].reshape(3, 3)
     extent = np.abs(axes) @ at.model.site_size[site]  # half sizes of the region along the axes of the world
-    floor = _floor(at, where, middle, extent)
-    spots = np.column_stack([middle[:2] + GRID * extent[:2], np.full(len(GRID), floor + below + 0.01)])
+    floor = _floor(at, destination, middle, extent)
+    spots = np.column_stack([middle[:2] + GRID * extent[:2], np.full(len(GRID), floor + foot + 0.01)])
     obstacles = at.others(thing, middle, float(extent[:2].max()) + 0.15)
     obstacles = obstacles[obstacles[:, 2] > floor + FLOOR]
     off_centre = 0.1 * np.linalg.norm(spots[:, :2] - middle[:2], axis=1)
@@ -100,40 +100,40 @@ def _place_of(at: Situation, thing: str, where: str, held: bool) -> Place:
         if held:
             costs += STAY * np.minimum(np.linalg.norm(spots[:, :2] - origin[:2], axis=1), REACHED)
             costs += _hindrance(hands, at.yaw + turn, obstacles) + far(at, hands)
-        best = int(np.argmin(costs))
-        out = form.out(spots[best], obstacles, OBLIQUE) if roofs[best] else None
-        if roofs[best] and out is None and not roofs.all():  # nothing can come in there
-            best = int(np.argmin(np.where(roofs > 0, np.inf, costs)))
-        elif held and out is not None:  # the hand must also have room where it comes down
-            other = int(np.argmin(costs + _hindrance(hands + out, at.yaw + turn, obstacles)))
-            other_out = form.out(spots[other], obstacles, OBLIQUE) if roofs[other] else None
-            if other_out is not None or not roofs[other]:
-                best, out = other, other_out
-        slack = float(np.clip(gaps[best], TIGHT, LOOSE)) if out is None else SLIT
-        options.append((float(gaps[best]), Place(spots[best], turn, slack, out)))
-        if gaps[best] > 0:
+        index = int(np.argmin(costs))
+        displacement = form.out(spots[index], obstacles, OBLIQUE) if roofs[index] else None
+        if roofs[index] and displacement is None and not roofs.all():  # nothing can come in there
+            index = int(np.argmin(np.where(roofs > 0, np.inf, costs)))
+        elif held and displacement is not None:  # the hand must also have room where it comes down
+            other_index = int(np.argmin(costs + _hindrance(hands + displacement, at.yaw + turn, obstacles)))
+            other_displacement = form.out(spots[other_index], obstacles, OBLIQUE) if roofs[other_index] else None
+            if other_displacement is not None or not roofs[other_index]:
+                index, displacement = other_index, other_displacement
+        slack = float(np.clip(gaps[index], TIGHT, LOOSE)) if displacement is None else SLIT
+        options.append((float(gaps[index]), Place(spots[index], turn, slack, displacement)))
+        if gaps[index] > 0:
             return options[-1][1]
-    (unturned_room, unturned), (room, place) = options[0], max(options, key=lambda option: option[0])
-    if room > unturned_room + MARGIN or extent[2] < THICK:
+    (first_room, first_place), (room, place) = options[0], max(options, key=lambda option: option[0])
+    if room > first_room + MARGIN or extent[2] < THICK:
         return place
-    return replace(unturned, slack=LOOSE)  # it fits nowhere, so it lies on what is there
+    return replace(first_place, slack=LOOSE)  # it fits nowhere, so it lies on what is there
 
 
-def _hindrance(hands: Array, yaw: float, rest: Array) -> Array:
+def _hindrance(hands: Array, yaw: float, obstacles: Array) -> Array:
     """Return costs (K,) of what is close to the hand at places (K, 3) [m]."""
-    return np.maximum(0, CLEAR - clearance(hands, np.full(len(hands), yaw), rest))
+    return np.maximum(0, CLEAR - clearance(hands, np.full(len(hands), yaw), obstacles))
 
 
-def _floor(at: Situation, where: str, middle: Array, extent: Array) -> float:
+def _floor(at: Situation, region: str, middle: Array, extent: Array) -> float:
     """Return the height [m] of the floor of a region, which has half sizes `extent` (3,) about its middle (3,)."""
-    owner = at.subject(where)
-    lowest = float(middle[2] - extent[2])
+    owner = at.subject(region)
+    bottom = float(middle[2] - extent[2])
     if not owner:
-        return lowest
+        return bottom
     points = at.points(owner)
-    under = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < 0.03
-    under &= points[:, 2] < middle[2] + max(0.0, THICK - extent[2])
-    return max(lowest, float(points[under, 2].max(initial=lowest)))
+    mask = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < 0.03
+    mask &= points[:, 2] < middle[2] + max(0.0, THICK - extent[2])
+    return max(bottom, float(points[mask, 2].max(initial=bottom)))
 
 
 def _turns(points: Array) -> tuple[float, ...]:
@@ -151,26 +151,26 @@ class _Form:
 
     def __init__(self, points: Array, origin: Array, turn: float) -> None:
         _, directions = np.linalg.eigh(np.cov(points[:, :2].T))
-        inside = (points[:, :2] - origin[:2]) @ directions
-        low, high = inside.min(axis=0), inside.max(axis=0)
+        coordinates = (points[:, :2] - origin[:2]) @ directions
+        low, high = coordinates.min(axis=0), coordinates.max(axis=0)
         self._half, self._height = (high - low) / 2, points[:, 2].max() - origin[2]
         self._axes = rotation_z(turn)[:2, :2] @ directions
         self._middle = self._axes @ (high + low) / 2
 
-    def _gaps(self, spots: Array, rest: Array) -> Array:
+    def _gaps(self, spots: Array, points: Array) -> Array:
         """Return how far points (N, 3) are outside of the box at places (K, 3): (K, N) [m], negative inside."""
-        offset = rest[None, :, :2] - spots[:, None, :2] - self._middle
-        across = np.abs(offset @ self._axes) - self._half
-        return np.maximum(across[..., 0], across[..., 1])
+        offset = points[None, :, :2] - spots[:, None, :2] - self._middle
+        distances = np.abs(offset @ self._axes) - self._half
+        return np.maximum(distances[..., 0], distances[..., 1])
 
     def room(self, spots: Array, rest: Array) -> tuple[Array, Array]:
         """Return the free room (K,) [m] about the box at places (K, 3), and how much roof covers it, (K,) 0…1.25."""
         if not len(rest):
             return np.ones(len(spots)), np.zeros(len(spots))
-        over = rest[:, 2] > spots[0, 2] + self._height
-        covered = (self._gaps(spots, _flat(rest[over])) < -MARGIN).sum(axis=1)
-        gaps = self._gaps(spots, _flat(rest[~over]))
-        return gaps.min(axis=1, initial=1.0), (covered > 0) / 4 + covered / max(int(covered.max(initial=0)), 1)
+        is_roof = rest[:, 2] > spots[0, 2] + self._height
+        counts = (self._gaps(spots, _thin(rest[is_roof])) < -MARGIN).sum(axis=1)
+        gaps = self._gaps(spots, _thin(rest[~is_roof]))
+        return gaps.min(axis=1, initial=1.0), (counts > 0) / 4 + counts / max(int(counts.max(initial=0)), 1)
 
     def out(
         self,
@@ -191,12 +191,12 @@ class _Form:
             margin: the margin [m].
             most: how far it may push other things [m].
         """
-        over = _flat(rest[rest[:, 2] > spot[2] + self._height] if over is None else over)
+        over = _thin(rest[rest[:, 2] > spot[2] + self._height] if over is None else over)
         distances = np.arange(0.02, 0.3, 0.02)
         ways = (distances[:, None, None] * WAYS).reshape(-1, 2)
         spots = spot + np.column_stack([ways, np.zeros(len(ways))])
-        beside = _flat(rest[rest[:, 2] <= spot[2] + self._height])
-        room = self._gaps(spots, beside).min(axis=1, initial=1.0).reshape(len(distances), -1)
+        neighbours = _thin(rest[rest[:, 2] <= spot[2] + self._height])
+        room = self._gaps(spots, neighbours).min(axis=1, initial=1.0).reshape(len(distances), -1)
         free = self._gaps(spots, over).min(axis=1, initial=1.0) > margin
         squeeze = np.maximum(0, np.maximum(SLIT - room, -np.minimum.accumulate(room, axis=0)))
         free &= (squeeze < most).ravel()
@@ -204,7 +204,7 @@ class _Form:
         return np.array([*ways[int(np.argmin(total))], 0.0]) if free.any() else None
 
 
-def _flat(points: Array) -> Array:
+def _thin(points: Array) -> Array:
     """Return the points (N, 3) thinned to one per cell of a horizontal grid."""
     squares = np.rint(points[:, :2] / SQUARE).astype(int) @ (1, 1 << 20)
     return points[np.unique(squares, return_index=True)[1]]

@@ -26,12 +26,12 @@ def clearance(spots: Array, yaws: Array, others: Array, leans: Array | float = 0
     others = others[others[:, 2] > spots[:, 2].min() - 0.02]
     offset = others[None, :, :2] - spots[:, None, :2]
     sine, cosine = np.sin(yaws)[:, None], np.cos(yaws)[:, None]
-    closing = np.abs(offset[..., 1] * cosine - offset[..., 0] * sine)
-    above = others[:, 2] - spots[:, 2:]
-    shift = np.tan(np.broadcast_to(leans, len(spots)))[:, None] * np.maximum(above, 0)
-    along = np.abs(offset[..., 0] * cosine + offset[..., 1] * sine + shift)
-    hand = np.where(above > PALM, np.hypot(np.maximum(closing - HAND, 0), along), 1.0)
-    fingers = np.where(above > -0.02, np.hypot(np.maximum(closing - 0.05, 0), along), 1.0)
+    closing_offset = np.abs(offset[..., 1] * cosine - offset[..., 0] * sine)
+    heights = others[:, 2] - spots[:, 2:]
+    shift = np.tan(np.broadcast_to(leans, len(spots)))[:, None] * np.maximum(heights, 0)
+    cross_offset = np.abs(offset[..., 0] * cosine + offset[..., 1] * sine + shift)
+    hand = np.where(heights > PALM, np.hypot(np.maximum(closing_offset - HAND, 0), cross_offset), 1.0)
+    fingers = np.where(heights > -0.02, np.hypot(np.maximum(closing_offset - 0.05, 0), cross_offset), 1.0)
     return np.minimum(hand, fingers).min(axis=1, initial=1.0)
 
 

@@ -57,8 +57,8 @@ def load_scene(name: str, things: Collection[str], detail: Detail | None) -> muj
     Raises:
         UserError: this MuJoCo cannot compile it.
     """
-    asked = f"{METHOD} {name} {sorted(things)} {detail} {mujoco.__version__}"
-    path = cache_folder().parent / "libero" / f"{hashlib.sha256(asked.encode()).hexdigest()[:24]}.mjb"
+    key = f"{METHOD} {name} {sorted(things)} {detail} {mujoco.__version__}"
+    path = cache_folder().parent / "libero" / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.mjb"
     if path.is_file():
         with suppress(ValueError):  # it is damaged
             return mujoco.MjModel.from_binary_path(str(path))
@@ -81,87 +81,87 @@ def save_model(model: mujoco.MjModel, path: Path) -> None:
 
 def _light(xml: str, things: Collection[str], detail: Detail | None) -> mujoco.MjModel:
     if detail is None:
-        return _invisible(xml)
-    full, spec = mujoco.MjSpec.from_string(xml).compile(), mujoco.MjSpec.from_string(xml)
+        return _collision_model(xml)
+    model, spec = mujoco.MjSpec.from_string(xml).compile(), mujoco.MjSpec.from_string(xml)
     meshes = [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_MESH]
     solid = {geom.meshname for geom in meshes if geom.contype or geom.conaffinity}
     for name in sorted({geom.meshname for geom in meshes} - solid):  # the order of a set differs between processes
-        most = detail.rest
+        limit = detail.rest
         if name.startswith(("robot0_", "gripper0_")):
-            most = detail.robot
+            limit = detail.robot
         if name.startswith(tuple(things)):
-            fine = int(full.mesh_facenum[full.mesh(name).id]) // FINE
-            most = min(max(detail.things, fine), MOST * detail.things)
+            count = int(model.mesh_facenum[model.mesh(name).id]) // FINE
+            limit = min(max(detail.things, count), MOST * detail.things)
         users = [geom for geom in meshes if geom.meshname == name]
-        if _largest_face(full, full.mesh(name).id) > BROAD:
+        if _largest_face(model, model.mesh(name).id) > BROAD:
             for material in {geom.material for geom in users} - {""}:
                 spec.material(material).specular = 0
-        if full.mesh_facenum[full.mesh(name).id] > most:
-            _thin(spec, full, name, most, users)
+        if model.mesh_facenum[model.mesh(name).id] > limit:
+            _thin(spec, model, name, limit, users)
     for texture in spec.textures:
         if texture.file:
-            _shrink(full, texture, detail.texels)
+            _shrink(model, texture, detail.texels)
     return spec.compile()
 
 
 def _largest_face(model: mujoco.MjModel, mesh: int) -> float:
     """Return the area of the largest face of a mesh [m²]."""
     vertices, faces = mesh_triangles(model, mesh)
-    one, two, three = vertices[faces].swapaxes(0, 1)
-    return float(np.linalg.norm(np.cross(two - one, three - one), axis=1).max()) / 2
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).max()) / 2
 
 
-def _invisible(xml: str) -> mujoco.MjModel:
+def _collision_model(xml: str) -> mujoco.MjModel:
     """Compile a scene without what is only drawn."""
     spec = mujoco.MjSpec.from_string(xml)
     for geom in list(spec.geoms):
         if not (geom.contype or geom.conaffinity):
             spec.delete(geom)
-    used = {geom.meshname for geom in spec.geoms}
+    mesh_names = {geom.meshname for geom in spec.geoms}
     for geom in spec.geoms:
         geom.material = ""
-    for part in [*(mesh for mesh in spec.meshes if mesh.name not in used), *spec.materials, *spec.textures]:
+    for part in [*(mesh for mesh in spec.meshes if mesh.name not in mesh_names), *spec.materials, *spec.textures]:
         spec.delete(part)
     return spec.compile()
 
 
-def _thin(spec: mujoco.MjSpec, full: mujoco.MjModel, name: str, most: int, users: Collection[mujoco.MjsGeom]) -> None:
+def _thin(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str, limit: int, users: Collection[mujoco.MjsGeom]) -> None:
     """Replace a mesh by one with fewer faces, in the frame of its file, which the geoms refer to."""
-    vertices, faces, texcoord = decimate(*_welded(full, full.mesh(name).id), most)
+    vertices, faces, texcoord = decimate(*_weld(model, model.mesh(name).id), limit)
     turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, full.mesh_quat[full.mesh(name).id])
-    made = spec.add_mesh(name=f"{name}_light")
-    made.uservert = (vertices @ turn.reshape(3, 3).T + full.mesh_pos[full.mesh(name).id]).ravel()
-    made.userface = faces.ravel()
-    made.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # it may have holes
-    if full.mesh_texcoordadr[full.mesh(name).id] >= 0:
+    mujoco.mju_quat2Mat(turn, model.mesh_quat[model.mesh(name).id])
+    mesh = spec.add_mesh(name=f"{name}_light")
+    mesh.uservert = (vertices @ turn.reshape(3, 3).T + model.mesh_pos[model.mesh(name).id]).ravel()
+    mesh.userface = faces.ravel()
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # it may have holes
+    if model.mesh_texcoordadr[model.mesh(name).id] >= 0:
         rows, places = np.unique(texcoord.reshape(-1, 2), axis=0, return_inverse=True)
-        made.usertexcoord, made.userfacetexcoord = rows.ravel(), places.ravel()
+        mesh.usertexcoord, mesh.userfacetexcoord = rows.ravel(), places.ravel()
     for geom in users:
-        geom.meshname = made.name
+        geom.meshname = mesh.name
     spec.delete(spec.mesh(name))
 
 
-def _welded(model: mujoco.MjModel, mesh: int) -> tuple[Array, Array, Array | None]:
+def _weld(model: mujoco.MjModel, mesh: int) -> tuple[Array, Array, Array | None]:
     """Return vertices, faces and corners' texture coordinates of a mesh, without vertices stored once per corner.
 
     Thinning would otherwise take every edge for a border, and keep it.
     """
     vertices, faces = mesh_triangles(model, mesh)
-    _, kept, places = np.unique(np.rint(vertices / WELD), axis=0, return_index=True, return_inverse=True)
-    return vertices[kept], places.ravel()[faces], mesh_texcoord(model, mesh)
+    _, indices, places = np.unique(np.rint(vertices / WELD), axis=0, return_index=True, return_inverse=True)
+    return vertices[indices], places.ravel()[faces], mesh_texcoord(model, mesh)
 
 
-def _shrink(full: mujoco.MjModel, texture: mujoco.MjsTexture, texels: int) -> None:
+def _shrink(model: mujoco.MjModel, texture: mujoco.MjsTexture, texels: int) -> None:
     """Give a texture its pixels instead of a file's, averaged to at most `texels` along an edge."""
-    number = full.texture(texture.name).id
-    height, width, channels = (int(of[number]) for of in (full.tex_height, full.tex_width, full.tex_nchannel))
-    start = int(full.tex_adr[number])
-    pixels = full.tex_data[start : start + height * width * channels].reshape(height, width, channels)
+    number = model.texture(texture.name).id
+    height, width, channels = (int(table[number]) for table in (model.tex_height, model.tex_width, model.tex_nchannel))
+    start = int(model.tex_adr[number])
+    pixels = model.tex_data[start : start + height * width * channels].reshape(height, width, channels)
     sides = np.split(pixels, 6 if height == 6 * width else 1)  # of a cube, one above the other
     size = min(texels, width), min(texels, len(sides[0]))
-    small = np.concatenate([np.asarray(Image.fromarray(side).resize(size, Image.Resampling.BOX)) for side in sides])
+    image = np.concatenate([np.asarray(Image.fromarray(side).resize(size, Image.Resampling.BOX)) for side in sides])
     texture.file, texture.gridsize = "", [1, 1]
-    texture.height, texture.width, texture.nchannel = *small.shape[:2], channels
-    texture.colorspace = mujoco.mjtColorSpace(int(full.tex_colorspace[number]))  # otherwise all colours turn pale
-    texture.data = small.tobytes()
+    texture.height, texture.width, texture.nchannel = *image.shape[:2], channels
+    texture.colorspace = mujoco.mjtColorSpace(int(model.tex_colorspace[number]))  # otherwise all colours turn pale
+    texture.data = image.tobytes()

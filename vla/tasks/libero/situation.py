@@ -34,12 +34,12 @@ class Situation:
         self.data, self.goal = mujoco.MjData(self.model), Goal(self.model, task.goal)
         self._shapes = {name: self._shape(root) for name, root in self.goal.bodies.items()}
         self._sparse = {name: _sparse(list(shapes.values())) for name, shapes in self._shapes.items()}
-        self._placed: dict[int, tuple[Array, list[Array]]] = {}
+        self._placements: dict[int, tuple[Array, list[Array]]] = {}
         self._site = self.model.site("gripper0_grip_site").id
         self.base = self.model.body("robot0_base").pos.copy()  # of the arm (3,) [m]
         names = {self.model.body(number).name: number for number in range(self.model.nbody)}
-        free = self.model.jnt_bodyid[self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
-        self._movable = set(self.goal.owner[free].tolist())
+        free_bodies = self.model.jnt_bodyid[self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+        self._movable = set(self.goal.owner[free_bodies].tolist())
         self._fingers = [
             [names[name] for name in (f"gripper0_{side}finger", f"gripper0_finger_joint{number}_tip") if name in names]
             for side, number in (("left", 1), ("right", 2))
@@ -47,7 +47,7 @@ class Situation:
 
     def take(self, truth: dict[str, Array]) -> None:
         """Set the state from the simulator's truth."""
-        bodies = [one["body"] for one in self.task.fixtures.values()]
+        bodies = [fixture["body"] for fixture in self.task.fixtures.values()]
         poses = {body: (pose[:3], pose[3:]) for body, pose in zip(bodies, truth["fixtures"], strict=True)}
         set_start(self.model, self.data, Start(truth["positions"], poses))
         self.opening = float(truth["opening"][0])  # commanded, 1 open and -1 closed
@@ -58,7 +58,7 @@ class Situation:
         self.yaw = float(np.arctan2(-closing[0], closing[1] if self.upright else across[0]))
         self.lean = float(np.arctan2(ahead[:2] @ (np.cos(self.yaw), np.sin(self.yaw)), -ahead[2]))
         self.__dict__.pop("rest", None)
-        self._known: dict[str, Array] = {}
+        self._points: dict[str, Array] = {}
 
     @property
     def upright(self) -> bool:
@@ -86,9 +86,9 @@ class Situation:
 
     def points(self, thing: str) -> Array:
         """Return points (N, 3) on the surface of a thing [m]."""
-        if thing not in self._known:
-            self._known[thing] = np.concatenate(self.pieces(thing))
-        return self._known[thing]
+        if thing not in self._points:
+            self._points[thing] = np.concatenate(self.pieces(thing))
+        return self._points[thing]
 
     def moving(self, joint: int) -> list[Array]:
         """Return points (N, 3) on each geom of the body that a joint moves [m]."""
@@ -99,15 +99,15 @@ class Situation:
     def others(self, thing: str, middle: Array, radius: float) -> Array:
         """Return points (N, 3) on all but one thing, in a square of half width `radius` about `middle` (2,) [m]."""
         points, owners = self.rest
-        near = (np.abs(points[:, :2] - middle[:2]) < radius).all(axis=1)
-        near &= owners != self.goal.bodies.get(thing, -1)
-        return points[near]
+        mask = (np.abs(points[:, :2] - middle[:2]) < radius).all(axis=1)
+        mask &= owners != self.goal.bodies.get(thing, -1)
+        return points[mask]
 
     @cached_property
     def rest(self) -> tuple[Array, Array]:
         """Points (N, 3) on all things [m], and the bodies (N,) that they belong to."""
         points = [self.points(thing)[self._sparse[thing]] for thing in self._shapes]
-        owners = [np.full(len(some), body) for some, body in zip(points, self.goal.bodies.values(), strict=True)]
+        owners = [np.full(len(cloud), body) for cloud, body in zip(points, self.goal.bodies.values(), strict=True)]
         return np.concatenate(points), np.concatenate(owners)
 
     def subject(self, name: str) -> str:
@@ -120,29 +120,29 @@ class Situation:
     def touched(self) -> str | None:
         """Return the movable thing that both fingers touch, or one of them if they are commanded shut and yet apart."""
         bodies = self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]
-        touched = []
+        contacts = []
         for fingers in self._fingers:
-            mine = np.isin(bodies, fingers)
-            one = mine.sum(axis=1) == 1
-            touched.append(set(self.goal.owner[bodies[one][~mine[one]]].tolist()))
-        shut = self.opening < SHUT and self.gap > THIN
-        held = touched[0] | touched[1] if shut else touched[0] & touched[1]
+            on_finger = np.isin(bodies, fingers)
+            is_pair = on_finger.sum(axis=1) == 1
+            contacts.append(set(self.goal.owner[bodies[is_pair][~on_finger[is_pair]]].tolist()))
+        is_shut = self.opening < SHUT and self.gap > THIN
+        held = contacts[0] | contacts[1] if is_shut else contacts[0] & contacts[1]
         return next((name for name, body in self.goal.bodies.items() if body in held and body in self._movable), None)
 
     def rests(self, thing: str) -> bool:
         """Return whether a thing touches another one that can be moved."""
         root, pairs = self.goal.bodies[thing], self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]
-        touching = self.goal.owner[pairs]
-        others = touching[(touching == root).any(axis=1)].ravel()
-        return bool(np.isin(others, list(self._movable - {root})).any())
+        owners = self.goal.owner[pairs]
+        neighbours = owners[(owners == root).any(axis=1)].ravel()
+        return bool(np.isin(neighbours, list(self._movable - {root})).any())
 
     def _place(self, thing: str, body: int) -> list[Array]:
         """Return points (N, 3) on each geom of a body [m], which are cached until the body moves."""
         pose = np.concatenate([self.data.xpos[body], self.data.xmat[body]])
-        if body not in self._placed or not np.array_equal(self._placed[body][0], pose):
+        if body not in self._placements or not np.array_equal(self._placements[body][0], pose):
             turn = pose[3:].reshape(3, 3).T
-            self._placed[body] = pose, [local @ turn + pose[:3] for local in self._shapes[thing].get(body, [])]
-        return self._placed[body][1]
+            self._placements[body] = pose, [local @ turn + pose[:3] for local in self._shapes[thing].get(body, [])]
+        return self._placements[body][1]
 
     def _shape(self, root: int) -> dict[int, list[Array]]:
         """Return body → points (N, 3) on each of its geoms, in its frame, for all bodies of the thing at `root`."""
@@ -153,8 +153,8 @@ class Situation:
             if self.goal.owner[body] != root:
                 continue
             if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
-                first = model.mesh_vertadr[model.geom_dataid[geom]]
-                points = model.mesh_vert[first : first + model.mesh_vertnum[model.geom_dataid[geom]]]
+                address = model.mesh_vertadr[model.geom_dataid[geom]]
+                points = model.mesh_vert[address : address + model.mesh_vertnum[model.geom_dataid[geom]]]
             else:
                 round_ = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER
                 points = _surface(model.geom_size[geom][[0, 0, 1]] if round_ else model.geom_size[geom])

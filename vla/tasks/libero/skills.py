@@ -42,25 +42,25 @@ def approach(at: Situation, grasp: Grasp, points: Array, thing: str, opening: fl
     slope = np.array([*(-np.tan(grasp.lean) * axes(grasp.yaw)[1]), 1.0])  # of the line on which the hand comes
     height = at.hand[2] - grasp.position[2]
     offset = (at.hand - grasp.position - max(height, 0.0) * slope) * (1, 1, 0)
-    away = float(np.hypot(*offset[:2]))
+    distance = float(np.hypot(*offset[:2]))
     turn = max(abs(at.turn_to(grasp.yaw)), abs(at.lean - grasp.lean))
-    loose = 1.0 if at.opening > 0.5 else 1.6  # fingers that have begun to close go on unless the hand is far off
-    if away < loose * NEAR and turn < loose * TURNED and abs(height) < loose * LEVEL:
+    factor = 1.0 if at.opening > 0.5 else 1.6  # fingers that have begun to close go on unless the hand is far off
+    if distance < factor * NEAR and turn < factor * TURNED and abs(height) < factor * LEVEL:
         return command(at, grasp.position, grasp.yaw, 1.0, grasp.lean)
-    others = at.others(thing, grasp.position, HAND)
+    obstacles = at.others(thing, grasp.position, HAND)
     # Heights of the hand at which its fingers are above the thing, and above what stands about.
-    thing_top, others_top = (each[:, 2].max(initial=-np.inf) + TIP + MARGIN for each in (points, others))
-    here = Grasp(grasp.position + offset, at.yaw, grasp.lean)
-    aligned = (NEAR if at.hand[2] > thing_top - 0.01 else 1.6 * NEAR) - away
-    turned = TURNED_ROOM * (1.6 * TURNED - turn)
+    thing_top, obstacle_top = (cloud[:, 2].max(initial=-np.inf) + TIP + MARGIN for cloud in (points, obstacles))
+    pose = Grasp(grasp.position + offset, at.yaw, grasp.lean)
+    aligned = (NEAR if at.hand[2] > thing_top - 0.01 else 1.6 * NEAR) - distance
+    turn_room = TURNED_ROOM * (1.6 * TURNED - turn)
     # How far [m] the hand is from where it may not come down, past what stands about and past the thing itself.
-    others_room = min(max(room_of(at, thing, here) - TOUCHING, aligned), ROOM - away, turned)
-    thing_room = min(max(gap_of(here, points), aligned), others_room)
+    obstacle_room = min(max(room_of(at, thing, pose) - TOUCHING, aligned), ROOM - distance, turn_room)
+    thing_room = min(max(gap_of(pose, points), aligned), obstacle_room)
     if opening < 0 and at.opening < 0.5:  # fingers that are still closed would come down on the thing
         thing_room = -ROOM
-    over_thing = lowest(at, thing_top + _funnel(away - NEAR), thing_room)
-    over_others = lowest(at, others_top + _funnel(-others_room), others_room)
-    rise = max(0.0, over_thing - grasp.position[2], over_others - grasp.position[2])
+    thing_height = lowest(at, thing_top + _funnel(distance - NEAR), thing_room)
+    obstacle_height = lowest(at, obstacle_top + _funnel(-obstacle_room), obstacle_room)
+    rise = max(0.0, thing_height - grasp.position[2], obstacle_height - grasp.position[2])
     target = grasp.position + rise * slope
     return command(at, rising(at, target), grasp.yaw, opening, grasp.lean)
 
@@ -84,26 +84,26 @@ def carry(at: Situation, thing: str, place: Place) -> Array:
     if place.hidden is not None:
         return command(at, at.hand + place.hidden + 0.01 * UP, yaw, 1.0, lean)
     if place.out is not None:  # a roof is over the place: first to where it ends, then straight in
-        way = place.out / np.linalg.norm(place.out)
+        direction = place.out / np.linalg.norm(place.out)
         offset = origin - place.spot
-        depth = float(offset @ way)  # that the thing still has to go in
-        aside = float(np.linalg.norm(offset - depth * way))
-        if aside > 0.02 or depth > np.linalg.norm(place.out) + 0.03:
+        depth = float(offset @ direction)  # that the thing still has to go in
+        deviation = float(np.linalg.norm(offset - depth * direction))
+        if deviation > 0.02 or depth > np.linalg.norm(place.out) + 0.03:
             place = Place(place.spot + place.out, place.turn, 0.0)
         elif depth > 0.004:
             return command(at, at.hand + place.spot - origin, yaw, 1.0, lean)
     offset = place.spot - origin
-    away = float(np.hypot(*offset[:2]))
+    distance = float(np.hypot(*offset[:2]))
     rests = offset[2] > -RESTS and place.slack == LOOSE and at.rests(thing)
-    if away < (0.03 if rests else min(0.015, place.slack)) and abs(place.turn) < TURNED:
+    if distance < (0.03 if rests else min(0.015, place.slack)) and abs(place.turn) < TURNED:
         if rests:
             return command(at, at.hand, yaw, -1.0, lean)
         if offset[2] > -0.012:
             return let_go(at, thing)
-    away += 0.1 * abs(place.turn)
-    target = at.hand + offset + np.clip(FUNNEL * (away - 0.6 * place.slack), 0.0, CARRY) * UP
-    clear = target[2] + max(0.0, _above(at, thing, place.spot))  # height over all that is on the way
-    target[2] = max(target[2], lowest(at, clear, max(place.slack, 0.015) - away))
+    distance += 0.1 * abs(place.turn)
+    target = at.hand + offset + np.clip(FUNNEL * (distance - 0.6 * place.slack), 0.0, CARRY) * UP
+    pass_height = target[2] + max(0.0, _pass_height(at, thing, place.spot))  # height over all that is on the way
+    target[2] = max(target[2], lowest(at, pass_height, max(place.slack, 0.015) - distance))
     return command(at, rising(at, target), yaw, 1.0, lean)
 
 
@@ -124,36 +124,36 @@ def alike(at: Situation, grasp: Grasp) -> Grasp:
     return Grasp(grasp.position, at.yaw + turn, grasp.lean if same else -grasp.lean)
 
 
-def _above(at: Situation, thing: str, spot: Array) -> float:
+def _pass_height(at: Situation, thing: str, spot: Array) -> float:
     """Return how far above its spot a thing must be to pass over everything on the way there [m]."""
     origin = at.origin(thing)
-    lowest = at.points(thing)[:, 2].min() - origin[2]
-    way = spot[:2] - origin[:2]
-    length = float(np.hypot(*way)) + 1e-9
-    rest = at.others(thing, (spot + origin) / 2, length / 2 + SWEEP)
-    along = np.clip((rest[:, :2] - origin[:2]) @ way / length, 0, length)
-    beside = np.linalg.norm(rest[:, :2] - origin[:2] - along[:, None] * way / length, axis=1)
-    return float(rest[beside < SWEEP, 2].max(initial=-np.inf) - (spot[2] + lowest))
+    bottom = at.points(thing)[:, 2].min() - origin[2]
+    path = spot[:2] - origin[:2]
+    length = float(np.hypot(*path)) + 1e-9
+    obstacles = at.others(thing, (spot + origin) / 2, length / 2 + SWEEP)
+    progress = np.clip((obstacles[:, :2] - origin[:2]) @ path / length, 0, length)
+    distances = np.linalg.norm(obstacles[:, :2] - origin[:2] - progress[:, None] * path / length, axis=1)
+    return float(obstacles[distances < SWEEP, 2].max(initial=-np.inf) - (spot[2] + bottom))
 
 
 def drag(at: Situation, thing: str, displacement: Array) -> Array:
     """Move a hollow thing that cannot be grasped by (3,) [m]: closed fingers inside press its wall."""
     points, origin = at.points(thing), at.origin(thing)
-    way = displacement / np.linalg.norm(displacement)
+    heading = displacement / np.linalg.norm(displacement)
     radius = float(np.ptp(points[:, :2], axis=0).min()) / 2
-    steps = origin + np.linspace(0.45, 0.0, 6)[:, None] * radius * way  # the farther out, the higher the bottom is
-    floors = np.array([_under(points, step) for step in steps])
+    steps = origin + np.linspace(0.45, 0.0, 6)[:, None] * radius * heading  # the farther out, the higher the bottom is
+    floors = np.array([_height_at(points, step) for step in steps])
     flat = floors <= floors[-1] + 0.35 * (points[:, 2].max() - floors[-1])
     spot = np.array([*steps[int(np.argmax(flat))][:2], floors[int(np.argmax(flat))] + TIP])
-    inside = np.linalg.norm((at.hand - origin)[:2]) < 0.8 * radius
-    yaw = float(np.arctan2(way[1], way[0]))
-    if inside and at.hand[2] < spot[2] + 0.006:
-        target = at.hand + min(SLOW, float(np.linalg.norm(displacement))) * way
+    is_inside = np.linalg.norm((at.hand - origin)[:2]) < 0.8 * radius
+    yaw = float(np.arctan2(heading[1], heading[0]))
+    if is_inside and at.hand[2] < spot[2] + 0.006:
+        target = at.hand + min(SLOW, float(np.linalg.norm(displacement))) * heading
         return command(at, np.array([*target[:2], spot[2] - 0.005]), yaw, 1.0)
     return approach(at, Grasp(spot, yaw), points, thing, closing(at, float(points[:, 2].max())))
 
 
-def _under(points: Array, spot: Array) -> float:
+def _height_at(points: Array, spot: Array) -> float:
     """Return the height of points (N, 3) at a spot (3,) [m]."""
     distance = np.linalg.norm(points[:, :2] - spot[:2], axis=1)
     return float(points[distance < max(0.012, float(distance.min())), 2].max(initial=points[:, 2].min()))
@@ -162,63 +162,63 @@ def _under(points: Array, spot: Array) -> float:
 def pull(at: Situation, place: str) -> Array:
     """Open a drawer by its handle: the hand comes from the front, one finger over the bar and one under it."""
     joint = int(at.goal.joints(place)[0])
-    way = -at.data.xaxis[joint]  # openings are negative
-    bar = max(at.moving(joint), key=lambda points: float((points @ way).max()))
-    middle = (bar.max(axis=0) + bar.min(axis=0)) / 2 - 0.006 * way
-    turns = [np.stack([up, np.cross(-way, up), -way], axis=1) for up in (UP, -UP)]  # the fingers are alike
+    axis = -at.data.xaxis[joint]  # openings are negative
+    bar = max(at.moving(joint), key=lambda points: float((points @ axis).max()))
+    middle = (bar.max(axis=0) + bar.min(axis=0)) / 2 - 0.006 * axis
+    turns = [np.stack([side, np.cross(-axis, side), -axis], axis=1) for side in (UP, -UP)]  # the fingers are alike
     rotation = min(turns, key=lambda turn: float(np.linalg.norm(_turn(at, turn))))
     offset = at.hand - middle
-    before = float(offset @ way)
-    aside, wrong = float(np.linalg.norm(offset - before * way)), float(np.linalg.norm(_turn(at, rotation)))
-    if aside < 1.5 * NEAR and wrong < 2 * TURNED and abs(before) < 2 * LEVEL:
+    distance = float(offset @ axis)
+    deviation, angle = float(np.linalg.norm(offset - distance * axis)), float(np.linalg.norm(_turn(at, rotation)))
+    if deviation < 1.5 * NEAR and angle < 2 * TURNED and abs(distance) < 2 * LEVEL:
         grips = at.opening < FIRM and at.gap > THIN
-        return move(at, middle + (0.012 if grips else 0.0) * way, rotation, 1.0)  # slowly, or the fingers slip
+        return move(at, middle + (0.012 if grips else 0.0) * axis, rotation, 1.0)  # slowly, or the fingers slip
     if at.upright and at.hand[2] < middle[2] - 0.03:
         return command(at, np.array([*at.hand[:2], middle[2]]), 0.0, -1.0)
-    if before < 0.09 and at.hand[2] < tops(at) and wrong > 0.5:
+    if distance < 0.09 and at.hand[2] < tops(at) and angle > 0.5:
         return move(at, at.hand + 0.05 * UP, rotation, -1.0)
-    room = min(2 * NEAR - aside, TURNED_ROOM * (2 * TURNED - wrong)) if at.opening > 0.9 else -ROOM
-    return move(at, middle + np.clip(before - FUNNEL * room, 0.0, 0.11) * way, rotation, -1.0)
+    room = min(2 * NEAR - deviation, TURNED_ROOM * (2 * TURNED - angle)) if at.opening > 0.9 else -ROOM
+    return move(at, middle + np.clip(distance - FUNNEL * room, 0.0, 0.11) * axis, rotation, -1.0)
 
 
 def twist(at: Situation, thing: str, turn: float) -> Array:
     """Turn a knob: grasp it from above across its narrow side, and turn the hand by `turn` [rad]."""
     joint = int(at.goal.joints(thing)[0])
-    moving = at.moving(joint)
-    grasp = min(parts(moving, alone=False), key=lambda one: one[0] + 0.02 * abs(at.turn_to(one[1].yaw)))[1]
+    pieces = at.moving(joint)
+    grasp = min(parts(pieces, alone=False), key=lambda pair: pair[0] + 0.02 * abs(at.turn_to(pair[1].yaw)))[1]
     grasp = Grasp(np.array([*at.data.xanchor[joint][:2], grasp.position[2]]), grasp.yaw)
     holds = at.opening < FIRM and at.gap > THIN and np.linalg.norm(at.hand - grasp.position) < 3 * NEAR
     if holds:
         return command(at, grasp.position, at.yaw + turn, 1.0)
-    return approach(at, grasp, np.concatenate(moving), thing)
+    return approach(at, grasp, np.concatenate(pieces), thing)
 
 
 def push(at: Situation, thing: str) -> Array:
     """Close a drawer or a door: push it, from outside, with closed fingers."""
     joint = int(at.goal.joints(thing)[0])
     points, axis = np.concatenate(at.moving(joint)), at.data.xaxis[joint]
-    ahead = axis
+    direction = axis
     if at.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
         arms = points - at.data.xanchor[joint]
         arms -= np.outer(arms @ axis, axis)
-        far = np.linalg.norm(arms, axis=1) / np.linalg.norm(arms, axis=1).max()
-        middle = (far > 0.5) & (far < 0.7)  # nearer to the hinge it is heavy, farther out the arm must stretch
-        points, ahead = points[middle], np.cross(axis, arms[middle].mean(axis=0))
-        ahead = ahead / np.linalg.norm(ahead)
-    depth = points @ ahead
+        reach = np.linalg.norm(arms, axis=1) / np.linalg.norm(arms, axis=1).max()
+        middle = (reach > 0.5) & (reach < 0.7)  # nearer to the hinge it is heavy, farther out the arm must stretch
+        points, direction = points[middle], np.cross(axis, arms[middle].mean(axis=0))
+        direction = direction / np.linalg.norm(direction)
+    depth = points @ direction
     face = points[depth < depth.min() + 0.012]
     contact = np.array([*face[:, :2].mean(axis=0), max(face[:, 2].max() - 0.035, face[:, 2].mean())])
     offset = at.hand - contact
-    before = float(offset @ ahead)
-    aside = float(np.linalg.norm((offset - before * ahead)[:2]))
+    distance = float(offset @ direction)
+    deviation = float(np.linalg.norm((offset - distance * direction)[:2]))
     # The fingers' broad side pushes, and the hand leans back, so that the arm stays off what is over a drawer.
-    pose = alike(at, Grasp(contact, float(np.arctan2(ahead[1], ahead[0])), BACK))
-    if -0.06 < before < 0.02 and aside < 0.03 and abs(offset[2]) < 0.03:
-        return command(at, contact + 0.05 * ahead, pose.yaw, 1.0, pose.lean)
+    pose = alike(at, Grasp(contact, float(np.arctan2(direction[1], direction[0])), BACK))
+    if -0.06 < distance < 0.02 and deviation < 0.03 and abs(offset[2]) < 0.03:
+        return command(at, contact + 0.05 * direction, pose.yaw, 1.0, pose.lean)
     grip = closing(at, tops(at))
-    start = contact - 0.045 * ahead
-    over = max(tops(at), contact[2]) + 0.04
-    start[2] = max(start[2], lowest(at, over, ROOM - float(np.hypot(*(at.hand - start)[:2]))))
+    start = contact - 0.045 * direction
+    height = max(tops(at), contact[2]) + 0.04
+    start[2] = max(start[2], lowest(at, height, ROOM - float(np.hypot(*(at.hand - start)[:2]))))
     return command(at, rising(at, start), pose.yaw, grip, pose.lean)
 
 
@@ -229,8 +229,8 @@ def closing(at: Situation, top: float) -> float:
 
 def withdraw(at: Situation) -> Array:
     """Retract a hand that does not point down, opposite to where it points, then turn it down."""
-    near = at.others("", at.hand, 0.1)
-    if len(near) and np.linalg.norm(near - at.hand, axis=1).min() < 0.09:
+    obstacles = at.others("", at.hand, 0.1)
+    if len(obstacles) and np.linalg.norm(obstacles - at.hand, axis=1).min() < 0.09:
         return move(at, at.hand - 0.05 * at.rotation[:, 2], at.rotation, -1.0)
     inwards = at.base - at.hand  # so that the arm is not stretched
     return command(at, at.hand + np.array([*(0.05 * inwards[:2] / np.hypot(*inwards[:2])), 0.02]), 0.0, -1.0)
@@ -252,9 +252,9 @@ def rising(at: Situation, target: Array) -> Array:
 def command(at: Situation, target: Array, yaw: float, grip: float, lean: float = 0.0) -> Array:
     """Return the command that moves the hand, pointing down, towards a position, a yaw and a lean."""
     yaw = at.yaw + at.turn_to(yaw)
-    closing, along = (np.array([*axis, 0.0]) for axis in axes(yaw))
-    ahead = np.sin(lean) * along - np.cos(lean) * UP
-    return move(at, target, np.stack([closing, np.cross(ahead, closing), ahead], axis=1), grip)
+    closing_axis, cross_axis = (np.array([*axis, 0.0]) for axis in axes(yaw))
+    direction = np.sin(lean) * cross_axis - np.cos(lean) * UP
+    return move(at, target, np.stack([closing_axis, np.cross(direction, closing_axis), direction], axis=1), grip)
 
 
 def move(at: Situation, target: Array, rotation: Array, grip: float) -> Array:
@@ -265,9 +265,9 @@ def move(at: Situation, target: Array, rotation: Array, grip: float) -> Array:
     return np.array([*step, *(turn / max(1.0, float(np.abs(turn).max()))), grip])
 
 
-def _turn(at: Situation, wanted: Array) -> Array:
+def _turn(at: Situation, rotation: Array) -> Array:
     """Return the rotation vector (3,), in the world, from the hand's rotation to another one."""
     quaternion, vector = np.empty(4), np.empty(3)
-    mujoco.mju_mat2Quat(quaternion, (wanted @ at.rotation.T).ravel())
+    mujoco.mju_mat2Quat(quaternion, (rotation @ at.rotation.T).ravel())
     mujoco.mju_quat2Vel(vector, quaternion, 1.0)
     return vector

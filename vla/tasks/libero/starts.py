@@ -55,15 +55,15 @@ class Starts:
             )
         self._model, self._task, self._states = model, task, states[:, 1 : 1 + model.nq]
         self._data = mujoco.MjData(model)
-        self._usual = self._overlapping(self.official(0))  # pairs that always overlap, such as a drawer and its cabinet
+        self._usual = self._overlaps(self.official(0))  # pairs that always overlap, such as a drawer and its cabinet
         self._owners = {part[1]: part[2] for part in task.initial if part[0] in ("on", "in")}
         self._exchangeable = [thing for thing in self._owners if self._may_move(thing)]
 
     def official(self, number: int) -> Start:
         """Return an official start, with the fixtures as in the task, because its state does not contain them."""
         poses = {
-            one["body"]: (np.array(one["position"]), np.array(one["quaternion"]))
-            for one in self._task.fixtures.values()
+            fixture["body"]: (np.array(fixture["position"]), np.array(fixture["quaternion"]))
+            for fixture in self._task.fixtures.values()
         }
         return Start(self._states[number].copy(), poses)
 
@@ -76,7 +76,7 @@ class Starts:
         """
         start = self._draw(random, exchanged)
         for _ in range(DRAWS):
-            if self._overlapping(start) <= self._usual:
+            if self._overlaps(start) <= self._usual:
                 break
             start = self._draw(random, exchanged)
         return start
@@ -90,8 +90,8 @@ class Starts:
             if {tuple(exchange.get(name, name) for name in part) for part in goal} != goal:
                 return False
         regions = {name for part in goal for name in part if self._on_table(name)}
-        named = {word for region in regions for word in region.split("_")}  # such as "plate" of a place beside one
-        return self._on_table(self._owners[thing]) and named.isdisjoint(kind.split("_"))
+        words = {word for region in regions for word in region.split("_")}  # such as "plate" of a place beside one
+        return self._on_table(self._owners[thing]) and words.isdisjoint(kind.split("_"))
 
     def _on_table(self, region: str) -> bool:
         return bool(self._task.regions.get(region, {}).get("ranges"))
@@ -102,7 +102,7 @@ class Starts:
             order = random.permutation(self._exchangeable).tolist()
             for one, other in zip(order[0:4:2], order[1:4:2], strict=False):
                 owners[one], owners[other] = owners[other], owners[one]
-        moved = {name: self._move_fixture(name, owners.get(name), start, random) for name in self._task.fixtures}
+        motions = {name: self._move_fixture(name, owners.get(name), start, random) for name in self._task.fixtures}
         start.qpos[:7] = HOME + POSTURE_NOISE * random.standard_normal(7)
         for joint in range(9, model.njnt):
             place = model.jnt_qposadr[joint]
@@ -111,7 +111,7 @@ class Starts:
                 start.qpos[place] = random.uniform(span.min(), span.max())
                 continue
             name = model.body(model.jnt_bodyid[joint]).name.removesuffix("_main")
-            start.qpos[place : place + 2] = self._place(owners.get(name, ""), place, moved, random)
+            start.qpos[place : place + 2] = self._place(owners.get(name, ""), place, motions, random)
             start.qpos[place + 3 : place + 7] = self._turn(place, random)
         for thing, base in owners.items():  # a thing on another one
             if base in owners and base not in self._task.fixtures:
@@ -141,41 +141,41 @@ class Starts:
         turn = random.uniform(*sorted(np.ravel(self._task.regions[str(region)]["yaw_rotation"])[:2]))
         if turn or region != self._owners[name]:
             quaternion = np.array([np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)])
-        by = _yaw(quaternion) - _yaw(start.fixtures[body][1])
-        rotation = np.array([[np.cos(by), -np.sin(by)], [np.sin(by), np.cos(by)]])
+        angle = _yaw(quaternion) - _yaw(start.fixtures[body][1])
+        rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         start.fixtures[body] = np.array([*place, position[2]]), quaternion
         return lambda point: place + rotation @ (point - position[:2])
 
-    def _place(self, region: str, row: int, moved: dict[str, Motion], random: np.random.Generator) -> Array:
+    def _place(self, region: str, row: int, motions: dict[str, Motion], random: np.random.Generator) -> Array:
         """Draw x and y of a thing [m]."""
         place = self._region(region, random)
         if place is not None:
             return place
         span = self._states[:, row : row + 2]
-        with_fixture = next((motion for fixture, motion in moved.items() if region.startswith(fixture)), None)
+        fixture_motion = next((motion for fixture, motion in motions.items() if region.startswith(fixture)), None)
         place = random.uniform(span.min(axis=0), span.max(axis=0))
-        return place if with_fixture is None else with_fixture(place)
+        return place if fixture_motion is None else fixture_motion(place)
 
     def _turn(self, row: int, random: np.random.Generator) -> Array:
         """Draw the quaternion of a thing like the official ones, which differ only in yaw, if at all."""
         quaternions = self._states[:, row + 3 : row + 7]
-        first, relative = quaternions[0], np.empty(4)
-        conjugate = first * np.array([1, -1, -1, -1])
+        reference, relative = quaternions[0], np.empty(4)
+        conjugate = reference * np.array([1, -1, -1, -1])
         yaws = []
         for quaternion in quaternions:
             mujoco.mju_mulQuat(relative, quaternion, conjugate)
             yaws.append(2 * np.arctan2(relative[3], relative[0]))
         yaws = np.angle(np.exp(1j * np.array(yaws)))
-        yaw, turned = random.uniform(yaws.min(), yaws.max()), np.empty(4)
-        mujoco.mju_mulQuat(turned, np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]), first)
-        return turned
+        yaw, result = random.uniform(yaws.min(), yaws.max()), np.empty(4)
+        mujoco.mju_mulQuat(result, np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]), reference)
+        return result
 
-    def _overlapping(self, start: Start) -> set[tuple[int, int]]:
+    def _overlaps(self, start: Start) -> set[tuple[int, int]]:
         """Return the pairs of bodies that penetrate each other by more than `OVERLAP`."""
         set_start(self._model, self._data, start)
         contact = self._data.contact
-        deep = contact.geom[: self._data.ncon][contact.dist[: self._data.ncon] < -OVERLAP]
-        return {(int(one), int(other)) for one, other in np.sort(self._model.geom_bodyid[deep], axis=1)}
+        geoms = contact.geom[: self._data.ncon][contact.dist[: self._data.ncon] < -OVERLAP]
+        return {(int(one), int(other)) for one, other in np.sort(self._model.geom_bodyid[geoms], axis=1)}
 
 
 def _yaw(quaternion: Array) -> float:

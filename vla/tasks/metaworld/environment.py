@@ -77,14 +77,14 @@ class MetaWorld(ManyTasks):
             UserError: a task is unknown or has no sentence, or pictures would be stretched.
         """
         super().__init__()
-        known = self._known = tasks_of("mt50")  # the truth gives a task by its index here
+        all_tasks = self._all_tasks = tasks_of("mt50")  # the truth gives a task by its index here
         self.tasks = tuple(tasks_of(tasks) if isinstance(tasks, str) else tasks)
-        listed = {*self.tasks, *sentences, *(name for names in tiers.values() for name in names)}
-        if unknown := sorted(listed - {*known}):
-            among = suggestion(unknown[0], known) or f": it has {', '.join(sorted(known))}"
-            raise UserError(f"Meta-World has no task {', '.join(unknown)}{among}")
-        if silent := [name for name in self.tasks if name not in sentences]:
-            raise UserError(f"task.sentences lacks {', '.join(silent)}: give every task an instruction")
+        task_names = {*self.tasks, *sentences, *(name for names in tiers.values() for name in names)}
+        if unknown_tasks := sorted(task_names - {*all_tasks}):
+            hint = suggestion(unknown_tasks[0], all_tasks) or f": it has {', '.join(sorted(all_tasks))}"
+            raise UserError(f"Meta-World has no task {', '.join(unknown_tasks)}{hint}")
+        if missing_tasks := [name for name in self.tasks if name not in sentences]:
+            raise UserError(f"task.sentences lacks {', '.join(missing_tasks)}: give every task an instruction")
         squares = [name for name in cameras if name != CAMERA or window is None]
         if squares and image_size[0] != image_size[1]:
             raise UserError(
@@ -110,7 +110,7 @@ class MetaWorld(ManyTasks):
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`."""
-        self.task, self.done, self.outcome, self._taken = self.task_of(seed), False, "timeout", 0
+        self.task, self.done, self.outcome, self._steps_taken = self.task_of(seed), False, "timeout", 0
         self._scene = self._scene_of(self.task, partial(self._make_scene, self.task))
         observation = self._scene.reset(seed)
         places = {"object": observation[OBJECT], "goal": observation[GOAL]}
@@ -122,8 +122,8 @@ class MetaWorld(ManyTasks):
         self._require_running()
         observation, solved = self._scene.step(_command(np.clip(action, self.spec.low, self.spec.high)))
         self.outcome = "success" if solved else "timeout"
-        self._taken += 1
-        self.done = solved or self._taken == self._steps
+        self._steps_taken += 1
+        self.done = solved or self._steps_taken == self._steps
         return self._look(observation)
 
     def _look(self, observation: Array) -> Observation:
@@ -134,7 +134,7 @@ class MetaWorld(ManyTasks):
             "goal": observation[GOAL],
             "commanded_position": self._scene.simulator.data.mocap_pos[0].copy(),
             "observation": observation,
-            "task": np.array([self._known.index(self.task)]),
+            "task": np.array([self._all_tasks.index(self.task)]),
         }
         return Observation(
             rgb=dict(zip(self.spec.cameras, pictures, strict=False)),

@@ -39,15 +39,15 @@ def tasks_of(benchmark: str) -> tuple[str, ...]:
 
 def simulator(task: str) -> Any:
     """Make the simulator of a task; its resets draw object and goal with the random generator that `seed` seeds."""
-    made = env_dict.ALL_V3_ENVIRONMENTS[task + VERSION]()
+    environment = env_dict.ALL_V3_ENVIRONMENTS[task + VERSION]()
     # Like `set_task` of the benchmark MT1, but without freezing the positions of object and goal.
-    made._partially_observable = False  # the goal is part of the observation, which only the expert sees
-    made.__dict__.pop("sawyer_observation_space", None)  # cached, and depends on it
-    made._set_task_called = True
-    made._freeze_rand_vec, made.seeded_rand_vec = False, True
+    environment._partially_observable = False  # the goal is part of the observation, which only the expert sees
+    environment.__dict__.pop("sawyer_observation_space", None)  # cached, and depends on it
+    environment._set_task_called = True
+    environment._freeze_rand_vec, environment.seeded_rand_vec = False, True
     # Published results are from MuJoCo 3.3.0, where multiple contacts per pair of meshes were off by default.
-    made.model.opt.disableflags |= getattr(mujoco.mjtDisableBit, "mjDSBL_MULTICCD", 0)
-    return made
+    environment.model.opt.disableflags |= getattr(mujoco.mjtDisableBit, "mjDSBL_MULTICCD", 0)
+    return environment
 
 
 def stop_sliding(simulator: Any) -> None:

@@ -30,27 +30,27 @@ class TaskScene:
 
     def __init__(self, task: str, spec: Spec, renderer: RendererFactory, drawn: int | None, shadows: int) -> None:
         """Compile a task; a UserError if it lacks a camera. For `drawn` and `shadows` see `MetaWorld`."""
-        self.simulator, self._size, self._drawn = simulator(task), spec.image_size, drawn
+        self.simulator, self._size, self._drawn_size = simulator(task), spec.image_size, drawn
         self.model = model = self.simulator.model
         cameras = spec.cameras
-        known = [model.camera(number).name for number in range(model.ncam)]
-        if unknown := [name for name in cameras if name not in (*known, HAND)]:
+        names = [model.camera(number).name for number in range(model.ncam)]
+        if unknown := [name for name in cameras if name not in (*names, HAND)]:
             raise UserError(
-                f"task.cameras names {', '.join(unknown)}; Meta-World has {', '.join(known)}, and {HAND}, which is "
+                f"task.cameras names {', '.join(unknown)}; Meta-World has {', '.join(names)}, and {HAND}, which is "
                 f"the part of {CAMERA} around the hand"
             )
-        camera = known.index(CAMERA)
+        camera = names.index(CAMERA)
         model.cam_pos[camera] = CAMERA_PLACE
-        model.cam_quat[camera] = _turned()
+        model.cam_quat[camera] = _orientation()
         model.vis.quality.shadowsize = shadows
         model.mat_reflectance[:] = 0  # no renderer draws reflections, and none is visible from corner2
-        shown = {part.camera: part for part in spec.parts}
-        self._parts = [shown.get(name, Part(name)) for name in cameras]
-        self._places = [known.index(CAMERA if name == HAND else name) for name in cameras]
+        parts = {part.camera: part for part in spec.parts}
+        self._parts = [parts.get(name, Part(name)) for name in cameras]
+        self._places = [names.index(CAMERA if name == HAND else name) for name in cameras]
         # A full picture is drawn once per camera, even if several windows are cut from it.
-        seen = self._places if drawn is None else sorted(set(self._places))
+        camera_ids = self._places if drawn is None else sorted(set(self._places))
         height, width = self._size if drawn is None else (drawn, drawn)
-        self._views = Views(seen, height, width, site_groups=(0, 1, 2), aspect=1.0)
+        self._views = Views(camera_ids, height, width, site_groups=(0, 1, 2), aspect=1.0)
         self._renderer = LazyRenderer(renderer, self.model, self._views)
 
     def reset(self, seed: int) -> Array:
@@ -78,11 +78,11 @@ class TaskScene:
         """Draw every camera's picture (cameras, H, W, 3) uint8."""
         hand = self.simulator.get_endeff_pos()
         windows = np.array([part.at(hand) for part in self._parts])
-        if self._drawn is None:
+        if self._drawn_size is None:
             return self._renderer.render(self.simulator.data, windows)[0]
         pictures = dict(zip(self._views.cameras, self._renderer.render(self.simulator.data)[0], strict=True))
-        shown = zip(self._places, windows, strict=True)
-        return np.stack([cut(pictures[camera], window, self._size) for camera, window in shown])
+        crops = zip(self._places, windows, strict=True)
+        return np.stack([cut(pictures[camera], window, self._size) for camera, window in crops])
 
     def close(self) -> None:
         """Free physics and GL."""
@@ -102,19 +102,19 @@ def parts_of(cameras: Sequence[str], window: Sequence[float] | None, hand_size: 
         yield Part(HAND, (-half, -half, half, half), PLACE, MIDDLE, _projection(), LEROBOT)
 
 
-def _turned() -> Array:
+def _orientation() -> Array:
     """Return the orientation (4,) of CAMERA with LeRobot's half turn of its pictures, wxyz."""
-    turned = np.empty(4)
-    mujoco.mju_mulQuat(turned, np.array(ORIENTATION), HALF_TURN)
-    return turned
+    quaternion = np.empty(4)
+    mujoco.mju_mulQuat(quaternion, np.array(ORIENTATION), HALF_TURN)
+    return quaternion
 
 
 def _projection() -> tuple[float, ...]:
     """Return the (3, 4) matrix of `Part.projection` for LeRobot's picture, row by row."""
     axes = np.empty(9)
-    mujoco.mju_quat2Mat(axes, _turned())
-    across, up, behind = axes.reshape(3, 3).T
+    mujoco.mju_quat2Mat(axes, _orientation())
+    x_axis, y_axis, z_axis = axes.reshape(3, 3).T
     scale = 2 * np.tan(np.radians(FOVY / 2))  # height of the picture at a depth of 1
-    rows = np.stack([-behind * scale / 2 - up, -behind * scale / 2 + across, -behind * scale])
-    moved = np.column_stack([rows, -rows @ np.array(CAMERA_PLACE)])
-    return tuple(moved.ravel().tolist())
+    rows = np.stack([-z_axis * scale / 2 - y_axis, -z_axis * scale / 2 + x_axis, -z_axis * scale])
+    matrix = np.column_stack([rows, -rows @ np.array(CAMERA_PLACE)])
+    return tuple(matrix.ravel().tolist())

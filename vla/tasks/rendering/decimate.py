@@ -31,9 +31,9 @@ def decimate(vertices: Array, faces: Array, texcoord: Array | None, most: int) -
     content = hashlib.sha256(f"{METHOD} {most} {len(vertices)}".encode() + vertices.tobytes() + faces.tobytes())
     content.update(b"" if texcoord is None else np.ascontiguousarray(texcoord, np.float32).tobytes())
     path = cache_folder() / f"{content.hexdigest()[:32]}.npz"
-    with suppress(OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error), np.load(path) as kept:
-        return kept["vertices"], kept["faces"], kept["texcoord"]
-    result = _simplified(vertices, faces, texcoord, most)
+    with suppress(OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error), np.load(path) as archive:
+        return archive["vertices"], archive["faces"], archive["texcoord"]
+    result = _simplify(vertices, faces, texcoord, most)
     # Written atomically, as other processes may read it; without disk space, the mesh is not cached.
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -47,23 +47,23 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vla" / "meshes"
 
 
-def _simplified(vertices: Array, faces: Array, texcoord: Array | None, most: int) -> Mesh:
+def _simplify(vertices: Array, faces: Array, texcoord: Array | None, count: int) -> Mesh:
     from fast_simplification import replay_simplification, simplify
 
-    fewer, triangles, collapses = simplify(vertices, faces, target_count=most, return_collapses=True)
-    fewer, triangles = np.asarray(fewer, np.float32), np.asarray(triangles, np.int32)
+    points, triangles, collapses = simplify(vertices, faces, target_count=count, return_collapses=True)
+    points, triangles = np.asarray(points, np.float32), np.asarray(triangles, np.int32)
     if texcoord is None:
-        return fewer, triangles, np.zeros((*triangles.shape, 2), np.float32)
-    moved, _, target = replay_simplification(vertices, faces, collapses)
+        return points, triangles, np.zeros((*triangles.shape, 2), np.float32)
+    positions, _, target = replay_simplification(vertices, faces, collapses)
     triangles = target[faces]  # every remaining face is an original one with its corners moved
-    one, two, three = triangles.T
-    kept = (one != two) & (two != three) & (three != one)
-    distance = np.linalg.norm(vertices - moved[target], axis=1)
-    coordinates = _transferred(faces, np.asarray(texcoord, np.float32), target, distance)
-    return np.asarray(moved, np.float32), triangles[kept].astype(np.int32), coordinates[kept]
+    a, b, c = triangles.T
+    mask = (a != b) & (b != c) & (c != a)
+    distance = np.linalg.norm(vertices - positions[target], axis=1)
+    coordinates = _transfer(faces, np.asarray(texcoord, np.float32), target, distance)
+    return np.asarray(positions, np.float32), triangles[mask].astype(np.int32), coordinates[mask]
 
 
-def _transferred(faces: Array, texcoord: Array, target: Array, distance: Array) -> Array:
+def _transfer(faces: Array, texcoord: Array, target: Array, distance: Array) -> Array:
     """Return the texture coordinates (F, 3, 2) of the corners of faces after their vertices were merged.
 
     A corner gets the mean over the vertices that were merged into one, weighted by 1 / distance². Where a texture seam
@@ -82,8 +82,8 @@ def _transferred(faces: Array, texcoord: Array, target: Array, distance: Array) 
     places, index = np.unique(corners, axis=0, return_inverse=True)  # vertices, those on a seam once per side
     index = index.reshape(faces.shape)
     starts, ends = index.ravel(), np.roll(index, -1, axis=1).ravel()
-    merged = target[faces].ravel() == target[np.roll(faces, -1, axis=1)].ravel()
-    edges = np.ones(merged.sum(), bool), (starts[merged], ends[merged])
+    mask = target[faces].ravel() == target[np.roll(faces, -1, axis=1)].ravel()
+    edges = np.ones(mask.sum(), bool), (starts[mask], ends[mask])
     label = connected_components(coo_array(edges, shape=(len(places),) * 2), directed=False)[1]
     weight = 1 / (distance[places[:, 0].astype(int)] ** 2 + 1e-12)
     means = [np.bincount(label, weight * values) / np.bincount(label, weight) for values in places[:, 1:].T]

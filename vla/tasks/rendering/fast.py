@@ -95,13 +95,13 @@ class FastRenderer:
         self._context, self._gl, self._settings, self._coarser = context, context.gl, settings, coarser
         self._model, self._views = model, views
         self._cameras = ModelCameras(model, views)
-        if missing := unsupported(model, views):
-            log.warning(f"the fast renderer leaves out {', '.join(missing)}; task/renderer=mujoco draws them")
+        if missing_features := unsupported(model, views):
+            log.warning(f"the fast renderer leaves out {', '.join(missing_features)}; task/renderer=mujoco draws them")
         sky = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
         self._sky = int(sky[0]) if len(sky) else -1
         self._geometry = Geometry(model, self._mesh)
-        casting = model.light_castshadow if model.vis.quality.shadowsize else np.zeros(model.nlight, bool)
-        self._lamps = [int(light) for light in uniforms.drawn_lights(model) if casting[light]]
+        casts_shadow = model.light_castshadow if model.vis.quality.shadowsize else np.zeros(model.nlight, bool)
+        self._lamps = [int(light) for light in uniforms.drawn_lights(model) if casts_shadow[light]]
         with context.used_by(self):
             self._make_targets()
             self._shadows = Shadows(self._gl, model, self._lamps, settings.soft)
@@ -124,8 +124,8 @@ class FastRenderer:
         gl, width, height = self._gl, self._views.width, self._views.height * len(self._views.cameras)
         self._fine = 2 if self._settings.samples == 4 else 1  # rows and columns per pixel
         size = self._fine * width, self._fine * height
-        self._drawn = gl.framebuffer(gl.renderbuffer(size, 4), self._context.depth_renderbuffer(size))
-        self._averaged = gl.framebuffer(gl.renderbuffer((width, height), 4)) if self._fine == 2 else self._drawn
+        self._framebuffer = gl.framebuffer(gl.renderbuffer(size, 4), self._context.depth_renderbuffer(size))
+        self._averaged = gl.framebuffer(gl.renderbuffer((width, height), 4)) if self._fine == 2 else self._framebuffer
 
     def _make_tables(self) -> None:
         """Make the textures of poses and appearance; an element is moved or changed by writing its row."""
@@ -141,9 +141,9 @@ class FastRenderer:
     def _make_programs(self) -> None:
         """Compile the shaders, one program per kind of texture, and assign units to the textures that all read."""
         gl, settings, lights = self._gl, self._settings, uniforms.drawn_lights(self._model).tolist()
-        spot = self._model.light_type == uniforms.SPOT
-        pixel = bool(spot[lights].any())  # light at vertices, as in MuJoCo, would miss the edge of a spot
-        lamps = {1 + lights.index(lamp): bool(spot[lamp]) for lamp in self._lamps}
+        is_spot = self._model.light_type == uniforms.SPOT
+        pixel = bool(is_spot[lights].any())  # light at vertices, as in MuJoCo, would miss the edge of a spot
+        lamps = {1 + lights.index(lamp): bool(is_spot[lamp]) for lamp in self._lamps}
         kinds: tuple[shaders.Skin, ...] = ("none", "2d", "cube")
         self._programs = {
             kind: gl.program(**shaders.scene_program(1 + len(lights), lamps, kind, pixel, settings.soft, self._coarser))
@@ -166,14 +166,14 @@ class FastRenderer:
 
     def _make_buffers(self) -> None:
         """Make the buffer of all geometry, and a vertex array per program, without the attributes it does not use."""
-        self._seen = Buffers(self._gl)
+        self._buffers = Buffers(self._gl)
         names = "in_position", "in_normal", "in_coordinate", "in_element"
         self._scene = {}
         for kind, program in self._programs.items():
-            taken = [name if name in program else None for name in names]
-            form = " ".join(f"{n}f" if name else f"{4 * n}x" for n, name in zip((3, 3, 3, 1), taken, strict=True))
-            content = [(self._seen.vertices, form, *(name for name in taken if name))]
-            self._scene[kind] = self._gl.vertex_array(program, content, self._seen.indices)
+            fields = [name if name in program else None for name in names]
+            form = " ".join(f"{n}f" if name else f"{4 * n}x" for n, name in zip((3, 3, 3, 1), fields, strict=True))
+            content = [(self._buffers.vertices, form, *(name for name in fields if name))]
+            self._scene[kind] = self._gl.vertex_array(program, content, self._buffers.indices)
 
     def update(self, textures: Collection[int] = ()) -> None:
         """Upload what has changed in the model; `textures` are the ids of textures with changed pixels."""
@@ -196,22 +196,22 @@ class FastRenderer:
 
     def _place_elements(self) -> None:
         """Upload the elements' triangles, and store their places in the buffer."""
-        placed, sky = self._geometry.elements, len(self._elements.kind)
-        self._seen.update([each.seen for each in placed])
-        ends = np.cumsum([0, *(each.seen.triangles.size for each in placed)]).tolist()
+        shapes, sky = self._geometry.elements, len(self._elements.kind)
+        self._buffers.update([shape.seen for shape in shapes])
+        ends = np.cumsum([0, *(shape.seen.triangles.size for shape in shapes)]).tolist()
         self._calls = {
-            each.element: DrawCall(self._texture_of(each.element), start, each.seen.triangles.size)
-            for each, start in zip(placed, ends, strict=False)
+            shape.element: DrawCall(self._texture_of(shape.element), start, shape.seen.triangles.size)
+            for shape, start in zip(shapes, ends, strict=False)
         }
         order = list(self._calls)
         solid, self._transparent = order[: self._geometry.solid], order[self._geometry.solid :]
         self._opaque = np.array([element for element in solid if element != sky], int)
-        radius = {each.element: each.radius for each in placed}
+        radius = {shape.element: shape.radius for shape in shapes}
         radius |= dict.fromkeys(self._planes, np.inf)  # they may move along with a camera
         self._radii = MARGIN * np.array([radius[element] for element in self._opaque])
         # Elements rarely enter or leave a picture, so the merged calls are cached for every set of visible elements.
-        self._merged: dict[bytes, list[DrawCall]] = {}  # whether each opaque element is in sight → what to draw
-        self._shadows.update([each for each in placed if each.element != sky])
+        self._batches: dict[bytes, list[DrawCall]] = {}  # whether each opaque element is in sight → what to draw
+        self._shadows.update([shape for shape in shapes if shape.element != sky])
 
     def _texture_of(self, element: int) -> int:
         texture = self._sky if element == len(self._elements.kind) else int(self._elements.texture[element])
@@ -246,10 +246,10 @@ class FastRenderer:
             self._upload_poses(data)
             self._uniforms.update(data, windows, self._shadows)
             self._shadows.cast(self._poses)
-            self._drawn.use()
+            self._framebuffer.use()
             self._gl.enable_only(STATE)
             self._gl.front_face = "cw"  # in pictures that are upside down
-            self._drawn.clear(depth=1.0)
+            self._framebuffer.clear(depth=1.0)
             self._draw_opaque()
             depth = self._draw_skies()
             self._draw_transparent()
@@ -270,12 +270,12 @@ class FastRenderer:
 
     def _draw_opaque(self) -> None:
         """Draw the opaque elements that the cameras may see."""
-        seen = self._cameras.may_see(self._poses[self._opaque, :, 3], self._radii)
-        for number, mask in enumerate(seen):
+        masks = self._cameras.may_see(self._poses[self._opaque, :, 3], self._radii)
+        for number, mask in enumerate(masks):
             self._aim(number)
-            calls = self._merged.get(key := mask.tobytes())
+            calls = self._batches.get(key := mask.tobytes())
             if calls is None:
-                calls = self._merged[key] = _merged([self._calls[element] for element in self._opaque[mask].tolist()])
+                calls = self._batches[key] = _merge([self._calls[element] for element in self._opaque[mask].tolist()])
             for call in calls:
                 self._draw(call)
 
@@ -285,7 +285,7 @@ class FastRenderer:
         Depth has to be read anyway, and reading it is cheaper than drawing a sky that is completely hidden.
         """
         depth = self._read_depth()
-        numbers = [number for number, seen in enumerate(depth) if self._sky >= 0 and seen.max() >= 1]
+        numbers = [number for number, pixels in enumerate(depth) if self._sky >= 0 and pixels.max() >= 1]
         for number in numbers:
             self._aim(number)
             self._draw(self._calls[len(self._elements.kind)])
@@ -294,33 +294,33 @@ class FastRenderer:
     def _draw_transparent(self) -> None:
         """Blend transparent elements and planes seen from behind."""
         for number in range(len(self._cameras.ids)):
-            behind = [plane for plane in self._planes if self._cameras.behind(number, self._poses[plane])]
-            if self._transparent or behind:
+            planes = [plane for plane in self._planes if self._cameras.behind(number, self._poses[plane])]
+            if self._transparent or planes:
                 self._aim(number)
-                self._blend(self._cameras.eyes[number], behind)
+                self._blend(self._cameras.eyes[number], planes)
 
-    def _blend(self, eye: Array, behind: list[int]) -> None:
+    def _blend(self, eye: Array, planes: list[int]) -> None:
         """Blend a camera's transparent elements as MuJoCo does: from near to far, and back again."""
         distance = {
             element: float(np.linalg.norm(self._poses[element, :, 3] - eye) - self._bounds[element])
-            for element in {*self._transparent, *behind}
+            for element in {*self._transparent, *planes}
         }
         distance |= {plane: np.inf for plane in self._planes if plane in distance}
         order = sorted(distance, key=lambda element: (distance[element], element))
         gl = self._gl
         gl.enable(moderngl.BLEND)
         gl.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
-        self._drawn.depth_mask = False  # what is transparent hides nothing, and has no depth
+        self._framebuffer.depth_mask = False  # what is transparent hides nothing, and has no depth
         self._leave_out_shadows(True)
         for element in [*order, *order[::-1]]:
             call, alpha = self._calls[element], float(self._elements.rgba[element, 3])
-            self._programs[self._kind(call.texture)]["alpha"] = alpha * (BEHIND if element in behind else 1.0)
-            if element in behind:
+            self._programs[self._kind(call.texture)]["alpha"] = alpha * (BEHIND if element in planes else 1.0)
+            if element in planes:
                 gl.disable(moderngl.CULL_FACE)
             self._draw(call)
             gl.enable(moderngl.CULL_FACE)
         self._leave_out_shadows(False)
-        self._drawn.depth_mask = True
+        self._framebuffer.depth_mask = True
         gl.disable(moderngl.BLEND)
 
     def _leave_out_shadows(self, value: bool) -> None:
@@ -332,25 +332,25 @@ class FastRenderer:
         """Read the depth buffer (cameras, rows, columns) float32, 0 at the near plane and 1 at the far one."""
         views = self._views
         depth = np.empty((len(views.cameras), self._fine * views.height, self._fine * views.width), np.float32)
-        self._drawn.read_into(depth, attachment=-1, components=1, dtype="f4", alignment=1)
+        self._framebuffer.read_into(depth, attachment=-1, components=1, dtype="f4", alignment=1)
         return depth
 
     def _read_colours(self) -> Array:
         rgb = np.empty((len(self._views.cameras), self._views.height, self._views.width, 3), np.uint8)
-        if self._averaged is not self._drawn:
-            self._context.halve(self._drawn, self._averaged)
+        if self._averaged is not self._framebuffer:
+            self._context.halve(self._framebuffer, self._averaged)
         self._averaged.read_into(rgb, components=3, alignment=1)
         return rgb
 
     def _metres(self, reading: Array) -> Array:
         """Convert readings of the depth buffer, 0 at the near plane and 1 at the far one, to depth [m], in place."""
         near, far = clip_range(self._model)
-        nothing = reading >= 1 if reading.max() >= 1 else None
+        background = reading >= 1 if reading.max() >= 1 else None
         depth = np.multiply(reading, near - far, out=reading)
         depth += far
         np.divide(near * far, depth, out=depth)
-        if nothing is not None:
-            np.copyto(depth, 0.0, where=nothing)
+        if background is not None:
+            np.copyto(depth, 0.0, where=background)
         return depth
 
     def close(self) -> None:
@@ -360,13 +360,13 @@ class FastRenderer:
         context.clean()
 
 
-def _merged(calls: Collection[DrawCall]) -> list[DrawCall]:
+def _merge(calls: Collection[DrawCall]) -> list[DrawCall]:
     """Join calls with the same texture that follow each other with a small gap, if any."""
-    merged: list[DrawCall] = []
+    result: list[DrawCall] = []
     for call in calls:
-        last = merged[-1] if merged else None
-        if last and last.texture == call.texture and call.start - last.start - last.count <= GAP:
-            merged.pop()
-            call = DrawCall(call.texture, last.start, call.start + call.count - last.start)
-        merged.append(call)
-    return merged
+        previous = result[-1] if result else None
+        if previous and previous.texture == call.texture and call.start - previous.start - previous.count <= GAP:
+            result.pop()
+            call = DrawCall(call.texture, previous.start, call.start + call.count - previous.start)
+        result.append(call)
+    return result

@@ -52,43 +52,43 @@ def elements_of(model: mujoco.MjModel, views: Views) -> Elements:
     light, texture = np.tile(np.array([0.0, 0.5, 0.5], np.float32), (len(kind), 1)), np.full(len(kind), -1, np.int32)
     with_material = np.flatnonzero(material >= 0)
     if len(with_material):
-        chosen = material[with_material]
-        plain = (rgba[with_material] == np.array(DEFAULT_RGBA, np.float32)).all(axis=1)
-        rgba[with_material[plain]] = model.mat_rgba[chosen[plain]]
+        materials = material[with_material]
+        is_default = (rgba[with_material] == np.array(DEFAULT_RGBA, np.float32)).all(axis=1)
+        rgba[with_material[is_default]] = model.mat_rgba[materials[is_default]]
         names = ("mat_emission", "mat_specular", "mat_shininess")
-        light[with_material] = np.stack([getattr(model, name)[chosen] for name in names], axis=1)
-        texture[with_material] = model.mat_texid[chosen, RGB_ROLE]
+        light[with_material] = np.stack([getattr(model, name)[materials] for name in names], axis=1)
+        texture[with_material] = model.mat_texid[materials, RGB_ROLE]
     group = np.clip(group, 0, mujoco.mjNGROUP - 1)
-    shown = np.isin(group, list(views.geom_groups))
-    shown[model.ngeom :] = np.isin(group[model.ngeom :], list(views.site_groups))
+    is_shown = np.isin(group, list(views.geom_groups))
+    is_shown[model.ngeom :] = np.isin(group[model.ngeom :], list(views.site_groups))
     # MuJoCo's sizes start with the radius of round shapes.
     size = size.astype(np.float32)
     round_ = np.isin(kind, (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER))
     size[round_] = size[round_][:, [0, 0, 1]]
     ball = kind == mujoco.mjtGeom.mjGEOM_SPHERE
     size[ball] = size[ball][:, [0, 0, 0]]
-    return Elements(kind, mesh, size, rgba, material, texture, light, shown & (rgba[:, 3] > 0))
+    return Elements(kind, mesh, size, rgba, material, texture, light, is_shown & (rgba[:, 3] > 0))
 
 
 def unsupported(model: mujoco.MjModel, views: Views) -> list[str]:
     """Name the features of a model that MuJoCo's renderer draws and the fast one does not."""
     elements = elements_of(model, views)
-    infinite = (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE) & (elements.size[:, :2] <= 0).any(axis=1)
+    is_infinite = (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE) & (elements.size[:, :2] <= 0).any(axis=1)
     sky = (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any()
-    odd = (mujoco.mjtLightType.mjLIGHT_POINT, mujoco.mjtLightType.mjLIGHT_IMAGE)
-    drawn = elements.material[elements.seen & (elements.material >= 0)]
-    present = {
+    light_types = (mujoco.mjtLightType.mjLIGHT_POINT, mujoco.mjtLightType.mjLIGHT_IMAGE)
+    materials = elements.material[elements.seen & (elements.material >= 0)]
+    features = {
         "height fields": (elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_HFIELD)).any(),
         "skins": model.nskin,
         "flexible bodies": model.nflex,
         "spatial tendons": (model.wrap_type != mujoco.mjtWrap.mjWRAP_JOINT).any(),
-        "reflections": (model.mat_reflectance[drawn] > 0).any(),
-        "haze at the horizon": sky and (elements.seen & infinite).any(),
-        "lights of the types point and image": np.isin(model.light_type, odd).any(),
+        "reflections": (model.mat_reflectance[materials] > 0).any(),
+        "haze at the horizon": sky and (elements.seen & is_infinite).any(),
+        "lights of the types point and image": np.isin(model.light_type, light_types).any(),
         "textures of one or two channels": (model.tex_nchannel < 3).any(),
         "slider-cranks": (model.actuator_trntype == mujoco.mjtTrn.mjTRN_SLIDERCRANK).any(),
     }
-    return [name for name, there in present.items() if there]
+    return [name for name, flag in features.items() if flag]
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,8 @@ class Part:
 
     def fits(self, other: Part) -> bool:
         """Return whether another part has as many vertices and the same triangles."""
-        same = len(self.vertices) == len(other.vertices)
-        return self is other or (same and np.array_equal(self.triangles, other.triangles))
+        same_size = len(self.vertices) == len(other.vertices)
+        return self is other or (same_size and np.array_equal(self.triangles, other.triangles))
 
 
 class Buffers:
@@ -113,11 +113,11 @@ class Buffers:
 
     def update(self, parts: Sequence[Part]) -> None:
         """Write the parts that have changed, or all of them where their layout has."""
-        old, self._parts = self._parts, list(parts)
+        old_parts, self._parts = self._parts, list(parts)
         starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-        if len(old) == len(parts) and all(before.fits(part) for before, part in zip(old, parts, strict=True)):
-            for before, part, start in zip(old, parts, starts, strict=False):
-                if before is not part:
+        if len(old_parts) == len(parts) and all(old.fits(part) for old, part in zip(old_parts, parts, strict=True)):
+            for old, part, start in zip(old_parts, parts, starts, strict=False):
+                if old is not part:
                     self.vertices.write(part.vertices, offset=int(start) * part.vertices[0].nbytes)
         elif parts:
             indices = [part.triangles + start for part, start in zip(parts, starts, strict=False)]
@@ -151,7 +151,7 @@ class Geometry:
         self._sphere, self._box = shapes.sphere(self._slices, self._stacks // 2 * 2), shapes.box()
         self._cylinder = shapes.cylinder(self._slices)
         self._reach = np.append(model.geom_rbound, model.site_size.max(axis=1))
-        self._known: dict[int, ElementTriangles] = {}  # element → its present triangles
+        self._cache: dict[int, ElementTriangles] = {}  # element → its present triangles
         self.elements: list[ElementTriangles] = []
 
     def update(self, elements: Elements, sky: bool) -> None:
@@ -160,25 +160,25 @@ class Geometry:
         planes = elements.kind == Kind.mjGEOM_PLANE
         # Small elements first: large ones are mostly behind them, and drawing hidden surfaces costs little.
         order = opaque[np.lexsort((opaque, self._reach[opaque], elements.texture[opaque], planes[opaque]))]
-        blended = [self._of(elements, int(each)) for each in np.flatnonzero(elements.seen & ~elements.opaque)]
-        solid = [self._of(elements, int(element)) for element in order]
+        transparent = [self._shape(elements, int(index)) for index in np.flatnonzero(elements.seen & ~elements.opaque)]
+        solid = [self._shape(elements, int(element)) for element in order]
         if sky:
             solid.append(self._sky(len(elements.kind)))
-        solid = [each for each in solid if len(each.seen.triangles)]
+        solid = [shape for shape in solid if len(shape.seen.triangles)]
         self.solid = len(solid)
-        self.elements = [*solid, *(each for each in blended if len(each.seen.triangles))]
+        self.elements = [*solid, *(shape for shape in transparent if len(shape.seen.triangles))]
 
-    def _of(self, elements: Elements, element: int) -> ElementTriangles:
+    def _shape(self, elements: Elements, element: int) -> ElementTriangles:
         model, material, texture = self._model, int(elements.material[element]), int(elements.texture[element])
         mapping = (*model.mat_texrepeat[material], int(model.mat_texuniform[material])) if texture >= 0 else ()
         kind, mesh = int(elements.kind[element]), int(elements.mesh[element])
         key = (kind, mesh, elements.size[element].tobytes(), texture, *mapping)
-        known = self._known.get(element)
-        if known is None or known.key != key:
+        entry = self._cache.get(element)
+        if entry is None or entry.key != key:
             surface = self._surface(kind, mesh, elements.size[element].astype(float), texture >= 0)
             coordinates = self._coordinates(surface, kind, mesh, elements.size[element], texture, mapping)
-            known = self._known[element] = _packed(element, key, surface, coordinates)
-        return known
+            entry = self._cache[element] = _pack(element, key, surface, coordinates)
+        return entry
 
     def _surface(self, kind: int, mesh: int, size: Array, textured: bool) -> Surface:
         if kind in (Kind.mjGEOM_SPHERE, Kind.mjGEOM_ELLIPSOID):
@@ -193,8 +193,8 @@ class Geometry:
             return shapes.plane(*(half if half > 0 else HORIZON * self._far for half in size[:2]))
         if kind in (Kind.mjGEOM_MESH, Kind.mjGEOM_SDF) and mesh >= 0:
             return self._mesh(mesh, textured)
-        nothing = np.empty((0, 3))
-        return Surface(nothing, nothing, nothing[:, :2], nothing, np.empty((0, 3), np.int32))
+        no_points = np.empty((0, 3))
+        return Surface(no_points, no_points, no_points[:, :2], no_points, np.empty((0, 3), np.int32))
 
     def _coordinates(
         self, surface: Surface, kind: int, mesh: int, size: Array, texture: int, mapping: tuple[float, ...]
@@ -204,7 +204,7 @@ class Geometry:
             return np.zeros((len(surface.position), 3))
         if self._model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
             return surface.raw * (size if mapping[2] else 1.0)
-        repeat = np.array([each if each > 0 else 1.0 for each in mapping[:2]])
+        repeat = np.array([factor if factor > 0 else 1.0 for factor in mapping[:2]])
         extent = np.where(size[:2] > 0, size[:2], 1.0)
         if kind == Kind.mjGEOM_PLANE and (size[:2] <= 0).any():
             flat = np.where(size[:2] > 0, surface.texcoord, surface.position[:, :2] * [0.5, -0.5])
@@ -217,15 +217,15 @@ class Geometry:
 
     def _sky(self, element: int) -> ElementTriangles:
         """Return the cylinder around the camera that shows the sky, seen from inside."""
-        if element not in self._known:
-            around = self._cylinder
-            position = around.position * SKY_DISTANCE * self._far
-            inside = replace(around, position=position, triangles=around.triangles[:, ::-1])
-            self._known[element] = _packed(element, (), inside, around.raw[:, [0, 2, 1]] * [1, 1, -1])
-        return self._known[element]
+        if element not in self._cache:
+            cylinder = self._cylinder
+            position = cylinder.position * SKY_DISTANCE * self._far
+            surface = replace(cylinder, position=position, triangles=cylinder.triangles[:, ::-1])
+            self._cache[element] = _pack(element, (), surface, cylinder.raw[:, [0, 2, 1]] * [1, 1, -1])
+        return self._cache[element]
 
 
-def _packed(element: int, key: tuple[Any, ...], surface: Surface, coordinates: Array) -> ElementTriangles:
+def _pack(element: int, key: tuple[Any, ...], surface: Surface, coordinates: Array) -> ElementTriangles:
     number = np.full((len(surface.position), 1), element)
     vertices = np.concatenate([surface.position, surface.normal, coordinates, number], axis=1, dtype=np.float32)
     outline = surface.outline

@@ -21,12 +21,12 @@ def clip_range(model: mujoco.MjModel) -> tuple[float, float]:
 
 def frustum(left: float, right: float, bottom: float, top: float, near: float, far: float) -> Array:
     """Return the perspective projection matrix (4, 4) of a frustum, given its rectangle at the near plane [m]."""
-    across, up, deep = right - left, top - bottom, far - near
+    width, height, depth = right - left, top - bottom, far - near
     return np.array(
         [
-            [2 * near / across, 0, (right + left) / across, 0],
-            [0, 2 * near / up, (top + bottom) / up, 0],
-            [0, 0, -(far + near) / deep, -2 * far * near / deep],
+            [2 * near / width, 0, (right + left) / width, 0],
+            [0, 2 * near / height, (top + bottom) / height, 0],
+            [0, 0, -(far + near) / depth, -2 * far * near / depth],
             [0, 0, -1, 0],
         ]
     )
@@ -34,9 +34,9 @@ def frustum(left: float, right: float, bottom: float, top: float, near: float, f
 
 def box(half_width: float, half_height: float, near: float, far: float) -> Array:
     """Return the orthographic projection matrix (4, 4) of a box around the optical axis; lengths in [m]."""
-    deep = far - near
+    depth = far - near
     return np.array(
-        [[1 / half_width, 0, 0, 0], [0, 1 / half_height, 0, 0], [0, 0, -2 / deep, -(far + near) / deep], [0, 0, 0, 1]]
+        [[1 / half_width, 0, 0, 0], [0, 1 / half_height, 0, 0], [0, 0, -2 / depth, -(far + near) / depth], [0, 0, 0, 1]]
     )
 
 
@@ -80,10 +80,10 @@ class ModelCameras:
 
     def _show(self, windows: Array | None) -> None:
         """Set the crop of each camera's field of view, (cameras, 4), see `Renderer.render`."""
-        lenses = self._whole if windows is None else _enlarging(windows) @ self._whole
+        lenses = self._whole if windows is None else _enlargements(windows) @ self._whole
         self._lenses, self._windows = UPSIDE_DOWN @ lenses, windows
-        across, up, deep, ahead = self._lenses.swapaxes(0, 1)
-        sides = np.stack([ahead + across, ahead - across, ahead + up, ahead - up, ahead + deep], axis=1)
+        x, y, z, w = self._lenses.swapaxes(0, 1)
+        sides = np.stack([w + x, w - x, w + y, w - y, w + z], axis=1)
         self._sides = sides / np.linalg.norm(sides[:, :, :3], axis=2, keepdims=True)  # of the frustums, looking inwards
 
     def place(self, data: mujoco.MjData, windows: Array | None) -> Array:
@@ -92,12 +92,12 @@ class ModelCameras:
             self._show(windows)
         self.eyes, self.axes = data.cam_xpos[self.ids], data.cam_xmat[self.ids].reshape(-1, 3, 3)
         poses = inverse_pose(self.eyes, self.axes.swapaxes(1, 2))
-        self._sides_there = self._sides @ poses
+        self._world_sides = self._sides @ poses
         return self._lenses @ poses
 
     def may_see(self, centres: Array, radii: Array) -> Array:
         """Return which spheres at `centres` (N, 3), of `radii` (N,) [m], reach into a picture: (cameras, N) bool."""
-        distances = self._sides_there[:, :, :3] @ centres.T + self._sides_there[:, :, 3:]
+        distances = self._world_sides[:, :, :3] @ centres.T + self._world_sides[:, :, 3:]
         return (distances > -radii).all(axis=1)
 
     def behind(self, number: int, plane: Array) -> bool:
@@ -119,7 +119,7 @@ class ModelCameras:
         return frustum(-aspect * half, aspect * half, -half, half, near, far)
 
 
-def _enlarging(windows: Array) -> Array:
+def _enlargements(windows: Array) -> Array:
     """Return transforms of clip space (cameras, 4, 4) after which windows (cameras, 4) fill the pictures."""
     top, left, bottom, right = windows.T
     transforms = np.tile(np.eye(4), (len(windows), 1, 1))

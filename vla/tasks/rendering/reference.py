@@ -62,8 +62,8 @@ class ReferenceRenderer:
 
     def _draw(self, data: mujoco.MjData, camera: int, window: Sequence[float] | None) -> None:
         self._camera.fixedcamid = camera
-        every = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, every, self._scene)
+        categories = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, categories, self._scene)
         if window is None and self._views.aspect is not None:
             window = WHOLE
         if window is not None:
@@ -73,12 +73,12 @@ class ReferenceRenderer:
 
     def _show(self, eye: mujoco.MjvGLCamera, top: float, left: float, bottom: float, right: float) -> None:
         """Narrow the frustum of one eye of the scene's camera to a window."""
-        above, height = eye.frustum_top, eye.frustum_top - eye.frustum_bottom
+        top_edge, height = eye.frustum_top, eye.frustum_top - eye.frustum_bottom
         # Half of the width, despite MuJoCo's name for it; if it is 0, the aspect ratio of the pictures determines it.
         half = eye.frustum_width or (self._views.aspect or self._views.width / self._views.height) * height / 2
         eye.frustum_center += half * (left + right - 1)
         eye.frustum_width = half * (right - left)
-        eye.frustum_top, eye.frustum_bottom = above - top * height, above - bottom * height
+        eye.frustum_top, eye.frustum_bottom = top_edge - top * height, top_edge - bottom * height
 
     def _metres(self, reading: Array) -> Array:
         """Convert a reverse-z buffer, 1 at the near plane and 0 at the far one, to depth [m]."""

@@ -83,7 +83,7 @@ def scene_program(
         coarser: bias on the mipmap level of textures.
     """
     count, spots = len(lamps), list(lamps.values())
-    shared = f"""#version 330
+    header = f"""#version 330
 layout(std140) uniform Camera {{
     mat4 projection;
     vec4 eye;
@@ -91,40 +91,40 @@ layout(std140) uniform Camera {{
     vec4 lights[{lights * ROWS}];
 }};
 {LIGHT.replace("ROWS", str(ROWS))}"""
-    passed = {"none": [], "2d": ["vec2 coordinate"], "cube": ["vec3 coordinate"]}[skin]
-    passed += [f"vec{4 if spot else 3} shadow_at{number}" for number, spot in enumerate(spots)]
-    passed += ["vec3 position", "vec3 normal", "vec3 colour", "vec4 material"] if pixel else []
-    passed += [] if pixel else ["vec3 base", *(f"vec3 lit{number}" for number in range(count))]
-    shaded = _shaded(lights, list(lamps))
+    fields = {"none": [], "2d": ["vec2 coordinate"], "cube": ["vec3 coordinate"]}[skin]
+    fields += [f"vec{4 if spot else 3} shadow_at{number}" for number, spot in enumerate(spots)]
+    fields += ["vec3 position", "vec3 normal", "vec3 colour", "vec4 material"] if pixel else []
+    fields += [] if pixel else ["vec3 base", *(f"vec3 lit{number}" for number in range(count))]
+    shading = _shading(lights, list(lamps))
     return {
-        "vertex_shader": shared + _vertex(passed, shaded, spots, skin, pixel),
-        "fragment_shader": shared + _fragment(passed, shaded, count, skin, pixel, soft, coarser),
+        "vertex_shader": header + _vertex(fields, shading, spots, skin, pixel),
+        "fragment_shader": header + _fragment(fields, shading, count, skin, pixel, soft, coarser),
     }
 
 
-def _declared(way: str, names: Sequence[str]) -> str:
-    return "\n".join(f"{way} {name};" for name in names)
+def _declarations(qualifier: str, names: Sequence[str]) -> str:
+    return "\n".join(f"{qualifier} {name};" for name in names)
 
 
-def _shaded(lights: int, lamps: Sequence[int]) -> str:
+def _shading(lights: int, lamps: Sequence[int]) -> str:
     """Return statements that set `base` and every `lit`, clamped as OpenGL clamps a vertex's colour."""
     shine = [f"shine({number}, position, normal, colour, material)" for number in range(lights)]
-    others = [shine[number] for number in range(lights) if number not in lamps]
-    sums = {"base": " + ".join(["vec3(material.w) + material.x * colour", *others])}
+    terms = [shine[number] for number in range(lights) if number not in lamps]
+    sums = {"base": " + ".join(["vec3(material.w) + material.x * colour", *terms])}
     sums |= {f"lit{index}": shine[number] for index, number in enumerate(lamps)}
     return "\n    ".join(f"{name} = clamp({value}, 0.0, 1.0);" for name, value in sums.items())
 
 
-def _vertex(passed: Sequence[str], shaded: str, spots: Sequence[bool], skin: Skin, pixel: bool) -> str:
+def _vertex(fields: Sequence[str], shading: str, spots: Sequence[bool], skin: Skin, pixel: bool) -> str:
     lookups = [
         f"shadow_at{number} = (shadow_projection[{number}] * vec4(position, 1.0)).{'xyzw' if spot else 'xyz'};"
         for number, spot in enumerate(spots)
     ]
-    moved = "in_coordinate + shift * texelFetch(table, ivec2(3, element), 0).xyz"
-    coordinate = {"none": "", "2d": f"coordinate = ({moved}).xy;", "cube": f"coordinate = {moved};"}[skin]
+    expression = "in_coordinate + shift * texelFetch(table, ivec2(3, element), 0).xyz"
+    coordinate = {"none": "", "2d": f"coordinate = ({expression}).xy;", "cube": f"coordinate = {expression};"}[skin]
     return f"""
 {PLACE}
-{_declared("out", passed)}
+{_declarations("out", fields)}
 void main() {{
     int element = int(in_element);
     mat3 turn;
@@ -135,40 +135,40 @@ void main() {{
     colour = texelFetch(table, ivec2(0, element), 0).rgb;
     material = texelFetch(table, ivec2(1, element), 0);
     {coordinate}
-    {"" if pixel else shaded}
+    {"" if pixel else shading}
     {" ".join(lookups)}
     gl_Position = projection * vec4(position, 1.0);
 }}"""
 
 
-def _fragment(passed: Sequence[str], shaded: str, count: int, skin: Skin, pixel: bool, soft: int, coarser: int) -> str:
+def _fragment(fields: Sequence[str], shading: str, count: int, skin: Skin, pixel: bool, soft: int, coarser: int) -> str:
     samplers = [f"sampler2DShadow shadow{number}" for number in range(count)]
     samplers += {"none": [], "2d": ["sampler2D skin"], "cube": ["samplerCube skin"]}[skin]
     names = ", ".join(["base", *(f"lit{number}" for number in range(count))])
-    local = f"vec3 {names};\n    {shaded.replace('normal,', 'normalize(normal),')}" if pixel else ""
-    lit = [f"sum += lit{each} * max(unshadowed, shown(shadow{each}, shadow_at{each}));" for each in range(count)]
-    looked_up = f"texture(skin, coordinate{f', {coarser}.0' if coarser else ''})"
+    local = f"vec3 {names};\n    {shading.replace('normal,', 'normalize(normal),')}" if pixel else ""
+    lamps = [f"sum += lit{lamp} * max(unshadowed, shown(shadow{lamp}, shadow_at{lamp}));" for lamp in range(count)]
+    lookup = f"texture(skin, coordinate{f', {coarser}.0' if coarser else ''})"
     return f"""
 uniform float unshadowed;
 uniform float alpha;
-{_declared("uniform", samplers)}
-{_declared("in", passed)}
+{_declarations("uniform", samplers)}
+{_declarations("in", fields)}
 out vec4 picture;
-{_shown("vec3", soft)}
-{_shown("vec4", soft)}
+{_shadow_lookup("vec3", soft)}
+{_shadow_lookup("vec4", soft)}
 void main() {{
     {local}
     vec3 sum = base;
-    {" ".join(lit)}
-    picture = vec4(sum, alpha) * {"vec4(1.0)" if skin == "none" else looked_up};
+    {" ".join(lamps)}
+    picture = vec4(sum, alpha) * {"vec4(1.0)" if skin == "none" else lookup};
 }}"""
 
 
-def _shown(kind: str, soft: int) -> str:
+def _shadow_lookup(kind: str, soft: int) -> str:
     """Return the GLSL function that looks up the share of a place's surroundings that is lit by a lamp; for a spot
     light, the place is a vec4 and is divided by its last component."""
     look, scale, end = ("texture", "1.0", "") if kind == "vec3" else ("textureProj", "at.w", ", 0.0")
     taps = [(x, y) for x in range(-soft, soft + 1) for y in range(-soft, soft + 1)]
     sums = [f"{look}(map, at + {kind}({x}.0 * texel.x, {y}.0 * texel.y, 0.0{end}))" for x, y in taps]
-    averaged = f"vec2 texel = {scale} / vec2(textureSize(map, 0));\n    return ({' + '.join(sums)}) / {len(taps)}.0;"
-    return f"float shown(sampler2DShadow map, {kind} at) {{\n    {averaged if soft else f'return {look}(map, at);'}\n}}"
+    average = f"vec2 texel = {scale} / vec2(textureSize(map, 0));\n    return ({' + '.join(sums)}) / {len(taps)}.0;"
+    return f"float shown(sampler2DShadow map, {kind} at) {{\n    {average if soft else f'return {look}(map, at);'}\n}}"

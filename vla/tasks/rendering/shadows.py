@@ -35,14 +35,14 @@ class Shadows:
         """Take the context, the model, ids of the lights, and texels over which the edges of shadows are averaged."""
         self._gl, self._lamps, self._soft = gl, list(lamps), soft
         self._edge = int(model.vis.quality.shadowsize)
-        self._still, self._drawn = ([self._target() for _ in self._lamps] for _ in range(2))
-        self.maps = [target.depth_attachment for target in self._drawn]
+        self._static_targets, self._targets = ([self._target() for _ in self._lamps] for _ in range(2))
+        self.maps = [target.depth_attachment for target in self._targets]
         self.program = gl.program(**shaders.SHADOW_PROGRAM)
         self._buffers = Buffers(gl)
         content = [(self._buffers.vertices, "3f 1f", "in_position", "in_element")]
         self._casters = gl.vertex_array(self.program, content, self._buffers.indices)
-        fixed = (model.body_weldid == 0) & (model.body_mocapid < 0)
-        self._fixed = np.flatnonzero(np.append(fixed[model.geom_bodyid], fixed[model.site_bodyid]))  # elements
+        is_static = (model.body_weldid == 0) & (model.body_mocapid < 0)
+        self._fixed = np.flatnonzero(np.append(is_static[model.geom_bodyid], is_static[model.site_bodyid]))  # elements
         self._state: bytes | None = None  # poses of the static elements in their maps
         self._written = -1  # number of the lamp whose uniforms the program has
 
@@ -60,11 +60,11 @@ class Shadows:
     def update(self, casters: Sequence[ElementTriangles]) -> None:
         """Upload the triangles that cast shadows."""
         fixed = set(self._fixed.tolist())
-        kinds = [(still, closed) for still in (True, False) for closed in (True, False)]
-        groups = [[each.casting for each in casters if (each.element in fixed, each.closed) == kind] for kind in kinds]
+        kinds = [(is_static, is_closed) for is_static in (True, False) for is_closed in (True, False)]
+        groups = [[item.casting for item in casters if (item.element in fixed, item.closed) == kind] for kind in kinds]
         self._buffers.update([part for group in groups for part in group])
         ends = np.cumsum([0, *(sum(part.triangles.size for part in group) for group in groups)]).tolist()
-        self._spans: list[Span] = [(first, end - first) for first, end in pairwise(ends)]
+        self._spans: list[Span] = [(start, end - start) for start, end in pairwise(ends)]
         self._state = None
 
     def aim(self, lamps: Array, projections: Sequence[Array]) -> None:
@@ -82,24 +82,24 @@ class Shadows:
         stale, self._state = state != self._state, state
         gl.front_face = "ccw"
         gl.polygon_offset = SLOPE + 2.0 * self._soft, UNITS  # averages reach across texels
-        for number, (still, drawn) in enumerate(zip(self._still, self._drawn, strict=True)):
+        for number, (static_target, target) in enumerate(zip(self._static_targets, self._targets, strict=True)):
             if number != self._written:
                 for name, content in self._uniforms[number].items():
                     self.program[name].write(content)
                 self._written = number
             if stale:
-                still.viewport = 0, 0, self._edge, self._edge
-                still.clear(depth=1.0)
-                self._draw(still, *self._spans[:2])
-            gl.copy_framebuffer(drawn, still)
-            self._draw(drawn, *self._spans[2:])
+                static_target.viewport = 0, 0, self._edge, self._edge
+                static_target.clear(depth=1.0)
+                self._draw(static_target, *self._spans[:2])
+            gl.copy_framebuffer(target, static_target)
+            self._draw(target, *self._spans[2:])
         gl.polygon_offset = 0.0, 0.0
 
-    def _draw(self, target: Any, closed: Span, still_open: Span) -> None:
+    def _draw(self, target: Any, closed_span: Span, open_span: Span) -> None:
         """Draw the front faces of closed surfaces, the nearest to a lamp outside, and both sides of open ones."""
         target.use()
         target.viewport = RIM // 2, RIM // 2, self._edge - RIM, self._edge - RIM
-        for state, (first, count) in ((STATE, closed), (moderngl.DEPTH_TEST, still_open)):
+        for state, (start, count) in ((STATE, closed_span), (moderngl.DEPTH_TEST, open_span)):
             if count:
                 self._gl.enable_only(state)
-                self._casters.render(moderngl.TRIANGLES, vertices=count, first=first)
+                self._casters.render(moderngl.TRIANGLES, vertices=count, first=start)

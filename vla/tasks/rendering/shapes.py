@@ -47,14 +47,14 @@ class Surface:
         if self.source is not None:
             return self.source.outline
         steps = np.rint(self.position / (WELD * max(np.abs(self.position).max(initial=0.0), 1e-9)))
-        _, first, inverse = np.unique(steps, axis=0, return_index=True, return_inverse=True)
+        _, indices, inverse = np.unique(steps, axis=0, return_index=True, return_inverse=True)
         triangles = inverse.reshape(-1)[self.triangles].astype(np.int32)
-        one, two, three = triangles.T
-        triangles = triangles[(one != two) & (two != three) & (three != one)]
-        return Outline(first, triangles, _closed(self.position[first].astype(np.float32), triangles))
+        a, b, c = triangles.T
+        triangles = triangles[(a != b) & (b != c) & (c != a)]
+        return Outline(indices, triangles, _is_closed(self.position[indices].astype(np.float32), triangles))
 
 
-def _closed(position: Array, triangles: Array) -> bool:
+def _is_closed(position: Array, triangles: Array) -> bool:
     """Return whether triangles (T, 3) of positions (W, 3) enclose a volume, and face away from it.
 
     Every edge must occur equally often in both directions.
@@ -62,17 +62,17 @@ def _closed(position: Array, triangles: Array) -> bool:
     if not len(triangles):
         return False
     edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
-    there, back = (np.sort(edges[:, first] * len(position) + edges[:, 1 - first]) for first in (0, 1))
+    forward, backward = (np.sort(edges[:, start] * len(position) + edges[:, 1 - start]) for start in (0, 1))
     corners = position[triangles] - position[triangles[0, 0]]
     volume = np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-    return bool(volume > 0 and (there == back).all())
+    return bool(volume > 0 and (forward == backward).all())
 
 
 def join(*shapes: Surface) -> Surface:
     """Join several shapes into one."""
     starts = np.cumsum([0, *(len(shape.position) for shape in shapes)])
-    position, normal, texcoord, raw = (np.concatenate([getattr(each, name) for each in shapes]) for name in VERTEX)
-    triangles = np.concatenate([each.triangles + start for each, start in zip(shapes, starts, strict=False)])
+    position, normal, texcoord, raw = (np.concatenate([getattr(shape, name) for shape in shapes]) for name in VERTEX)
+    triangles = np.concatenate([shape.triangles + start for shape, start in zip(shapes, starts, strict=False)])
     return Surface(position, normal, texcoord, raw, triangles)
 
 
@@ -111,8 +111,8 @@ def disk(slices: int, side: int) -> Surface:
     azimuth = 2 * np.pi * np.arange(slices) / slices
     rim = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(slices, float(side))], 1)
     position = np.concatenate([[[0.0, 0.0, side]], rim])
-    here = np.arange(slices)
-    triangles = np.stack([np.zeros(slices, int), 1 + here, 1 + (here + 1) % slices], 1)[:, ::side]
+    index = np.arange(slices)
+    triangles = np.stack([np.zeros(slices, int), 1 + index, 1 + (index + 1) % slices], 1)[:, ::side]
     normal = np.tile([0.0, 0.0, side], (slices + 1, 1))
     return Surface(position, normal, 0.5 + 0.5 * position[:, :2], position, triangles.astype(np.int32))
 
@@ -136,23 +136,23 @@ def capsule(slices: int, stacks: int, radius: float, half_length: float) -> Surf
 def box() -> Surface:
     """Return the cube from -1 to 1."""
     faces = []
-    across = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
-    for axis, (first, second), straight in ((2, (0, 1), 1), (0, (1, 2), 1), (1, (0, 2), -1)):
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+    for axis, (first, second), orientation in ((2, (0, 1), 1), (0, (1, 2), 1), (1, (0, 2), -1)):
         for side in (-1, 1):
             position, normal = np.full((4, 3), float(side)), np.zeros((4, 3))
-            position[:, first], position[:, second], normal[:, axis] = across[:, 0], across[:, 1], side
-            triangles = np.array([[0, 1, 2], [0, 2, 3]], np.int32)[:, :: side * straight]
-            faces.append(Surface(position, normal, 0.5 + across * [0.5, -0.5], position, triangles))
+            position[:, first], position[:, second], normal[:, axis] = corners[:, 0], corners[:, 1], side
+            triangles = np.array([[0, 1, 2], [0, 2, 3]], np.int32)[:, :: side * orientation]
+            faces.append(Surface(position, normal, 0.5 + corners * [0.5, -0.5], position, triangles))
     return join(*faces)
 
 
 def plane(half_x: float, half_y: float) -> Surface:
     """Return a rectangle in the plane z = 0 that faces along z; lengths in [m]."""
-    across = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
-    position = np.concatenate([across * [half_x, half_y], np.zeros((4, 1))], 1)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+    position = np.concatenate([corners * [half_x, half_y], np.zeros((4, 1))], 1)
     normal = np.tile([0.0, 0.0, 1.0], (4, 1))
     triangles = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return Surface(position, normal, 0.5 + across * [0.5, -0.5], position, triangles)
+    return Surface(position, normal, 0.5 + corners * [0.5, -0.5], position, triangles)
 
 
 def mesh_triangles(model: mujoco.MjModel, mesh: int) -> tuple[Array, Array]:
@@ -178,35 +178,35 @@ def mesh(model: mujoco.MjModel, number: int) -> Surface:
     normals = model.mesh_normal[model.mesh_normaladr[number] + model.mesh_facenormal[start:stop]]
     texcoord = mesh_texcoord(model, number)
     if texcoord is None:
-        return _shared(corners, _sharpened(corners, normals), np.zeros((*corners.shape[:2], 2), np.float32))
-    return _shared(corners, normals, texcoord)
+        return _share_vertices(corners, _sharpen(corners, normals), np.zeros((*corners.shape[:2], 2), np.float32))
+    return _share_vertices(corners, normals, texcoord)
 
 
 def smoothed(vertices: Array, faces: Array, texcoord: Array) -> Surface:
     """Return the surface of vertices (V, 3) and faces (F, 3) with texture coordinates (F, 3 corners, 2), with normals
     that are averaged over adjacent faces except at sharp edges."""
     corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    smooth = np.zeros_like(vertices)
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    vertex_normals = np.zeros_like(vertices)
     for corner in range(3):
-        np.add.at(smooth, faces[:, corner], across)
-    smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-20)
-    return _shared(corners, _sharpened(corners, smooth[faces]), texcoord)
+        np.add.at(vertex_normals, faces[:, corner], face_normals)
+    vertex_normals /= np.maximum(np.linalg.norm(vertex_normals, axis=1, keepdims=True), 1e-20)
+    return _share_vertices(corners, _sharpen(corners, vertex_normals[faces]), texcoord)
 
 
-def _sharpened(corners: Array, normals: Array) -> Array:
+def _sharpen(corners: Array, normals: Array) -> Array:
     """Return normals (F, 3, 3), replaced by the face's own one where they deviate much from it."""
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-20)
-    near = np.einsum("fci,fi->fc", normals, across) >= SMOOTH
-    return np.where(near[:, :, None], normals, across[:, None])
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    face_normals /= np.maximum(np.linalg.norm(face_normals, axis=1, keepdims=True), 1e-20)
+    is_smooth = np.einsum("fci,fi->fc", normals, face_normals) >= SMOOTH
+    return np.where(is_smooth[:, :, None], normals, face_normals[:, None])
 
 
-def _shared(corners: Array, normals: Array, texcoord: Array) -> Surface:
+def _share_vertices(corners: Array, normals: Array, texcoord: Array) -> Surface:
     """Return the surface of arrays (F, 3 corners, …), with equal vertices shared by its triangles."""
     rows = np.concatenate([corners, normals, texcoord], axis=2).reshape(-1, 8).astype(np.float32)
     rows = np.ascontiguousarray(rows + 0.0)  # no negative zeros
-    whole = rows.view(np.dtype((np.void, rows.itemsize * 8)))
-    _, first, inverse = np.unique(whole, return_index=True, return_inverse=True)
-    kept = rows[first]
-    return Surface(kept[:, :3], kept[:, 3:6], kept[:, 6:], kept[:, :3], inverse.reshape(-1, 3).astype(np.int32))
+    records = rows.view(np.dtype((np.void, rows.itemsize * 8)))
+    _, indices, inverse = np.unique(records, return_index=True, return_inverse=True)
+    table = rows[indices]
+    return Surface(table[:, :3], table[:, 3:6], table[:, 6:], table[:, :3], inverse.reshape(-1, 3).astype(np.int32))

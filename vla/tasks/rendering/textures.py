@@ -20,9 +20,9 @@ class Textures:
         for texture in np.flatnonzero(model.tex_nchannel >= 3).tolist():
             width, height = int(model.tex_width[texture]), int(model.tex_height[texture])
             flat = bool(model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D)
-            made = gl.texture((width, height), 4) if flat else gl.texture_cube((width, width), 4)
-            made.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
-            self.placed[texture] = made
+            gl_texture = gl.texture((width, height), 4) if flat else gl.texture_cube((width, width), 4)
+            gl_texture.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
+            self.placed[texture] = gl_texture
         self.upload(self.placed)
 
     def is_cube(self, texture: int) -> bool:

@@ -27,17 +27,17 @@ def light_rows(model: mujoco.MjModel) -> Array:
     """Return (1 + lights, ROWS, 4) float32: the headlight, then the drawn lights, still without poses."""
     lights = drawn_lights(model)
     table = np.zeros((1 + len(lights), ROWS, 4), np.float32)
-    head, active = model.vis.headlight, model.light_active[lights, None].astype(bool)
+    head, is_active = model.vis.headlight, model.light_active[lights, None].astype(bool)
     if head.active:
         table[0, :3, :3] = head.ambient, head.diffuse, head.specular
-    elif not active.any():
+    elif not is_active.any():
         table[0, 0, :3] = GLOBAL
     table[0, 5, 0] = 1
     for row, name in enumerate(("ambient", "diffuse", "specular")):
-        table[1:, row, :3] = np.where(active, getattr(model, f"light_{name}")[lights], 0)
-    spot = model.light_type[lights] == SPOT
-    table[1:, 3, 3], table[1:, 4, 3] = spot, np.cos(np.radians(model.light_cutoff[lights]))
-    table[1:, 5, :3] = np.where(spot[:, None], model.light_attenuation[lights], (1, 0, 0))
+        table[1:, row, :3] = np.where(is_active, getattr(model, f"light_{name}")[lights], 0)
+    is_spot = model.light_type[lights] == SPOT
+    table[1:, 3, 3], table[1:, 4, 3] = is_spot, np.cos(np.radians(model.light_cutoff[lights]))
+    table[1:, 5, :3] = np.where(is_spot[:, None], model.light_attenuation[lights], (1, 0, 0))
     table[1:, 5, 3] = model.light_exponent[lights]
     return table
 
@@ -70,11 +70,11 @@ class CameraUniforms:
     def _place_lights(self, data: mujoco.MjData, shadows: Shadows) -> None:
         table = light_rows(self._model)
         table[1:, 3, :3], table[1:, 4, :3] = data.light_xpos[self._lights], data.light_xdir[self._lights]
-        inner = 0.5 * (1 - RIM / max(1, self._model.vis.quality.shadowsize))
-        onto_texture = np.array([[inner, 0, 0, 0.5], [0, inner, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
+        scale = 0.5 * (1 - RIM / max(1, self._model.vis.quality.shadowsize))
+        texture_matrix = np.array([[scale, 0, 0, 0.5], [0, scale, 0, 0.5], [0, 0, 0.5, 0.5], [0, 0, 0, 1]])
         projections = [shadow_projection(self._model, data, lamp) for lamp in self._lamps]
         shadows.aim(data.light_xpos[self._lamps], projections)
-        columns = [(onto_texture @ projection).T.ravel() for projection in projections]
+        columns = [(texture_matrix @ projection).T.ravel() for projection in projections]
         content = np.concatenate([*columns, table.ravel()])
         self._blocks[:, CAMERA : CAMERA + content.size] = content
 

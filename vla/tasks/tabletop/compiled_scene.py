@@ -66,9 +66,9 @@ class CompiledScene:
         self._grips = np.array([model.actuator(name).id for name in robot.grips])
         self.block_geoms = np.array([model.geom(f"block{index}").id for index in range(blocks)], dtype=int)
         self.block_bodies = model.geom_bodyid[self.block_geoms]
-        free = model.body_jntadr[self.block_bodies]
-        self.block_positions = model.jnt_qposadr[free]  # address of x y z, quaternion wxyz
-        self.block_velocities = model.jnt_dofadr[free]
+        free_joints = model.body_jntadr[self.block_bodies]
+        self.block_positions = model.jnt_qposadr[free_joints]  # address of x y z, quaternion wxyz
+        self.block_velocities = model.jnt_dofadr[free_joints]
         self.zones = [int(model.body(f"{name}_pad").mocapid[0]) for name in PADS]
         self.cameras = {"front": model.camera("front").id, "wrist": model.camera(f"{robot.prefix}wrist").id}
         bodies = [model.body(body).name for body in model.geom_bodyid]
@@ -141,22 +141,22 @@ class CompiledScene:
 
     def finish(self, pads: int) -> None:
         """Make model and state consistent after all changes, with `pads` pads on the table."""
-        model, here = self.model, self.block_positions[: self.present]
+        model, addresses = self.model, self.block_positions[: self.present]
         for start in self.block_positions[self.present :]:
             self.data.qpos[start : start + 7] = (*AWAY, 1, 0, 0, 0)
-        absent = self.block_geoms[self.present :]
-        model.geom_contype[absent] = model.geom_conaffinity[absent] = 0
+        absent_geoms = self.block_geoms[self.present :]
+        model.geom_contype[absent_geoms] = model.geom_conaffinity[absent_geoms] = 0
         model.body_gravcomp[self.block_bodies[self.present :]] = 1.0
         self.data.mocap_pos[self.zones[pads:]] = AWAY
         mujoco.mj_setConst(model, self._scratch)  # without it, physics explodes after a change of mass
-        self.data.qpos[here + 2] = self.extents[: self.present, 2]
+        self.data.qpos[addresses + 2] = self.extents[: self.present, 2]
 
     def forward_without_servos(self) -> None:
         """Compute all quantities that depend on the state, without forces of the servos."""
-        option, off = self.model.opt, int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
-        option.disableflags |= off
+        option, flag = self.model.opt, int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+        option.disableflags |= flag
         mujoco.mj_forward(self.model, self.data)
-        option.disableflags &= ~off
+        option.disableflags &= ~flag
 
     def require_stable(self) -> None:
         """Raise a UserError if physics has become unstable in this episode."""
@@ -206,7 +206,7 @@ class CompiledScene:
         pairs = set()
         block_of = {int(geom): index for index, geom in enumerate(self.block_geoms)}
         for first, second in self.data.contact.geom[: self.data.ncon].tolist():
-            for tip, other in ((first, second), (second, first)):
-                if tip in self._side and other in block_of:
-                    pairs.add((self._side[tip], block_of[other]))
+            for tip, partner in ((first, second), (second, first)):
+                if tip in self._side and partner in block_of:
+                    pairs.add((self._side[tip], block_of[partner]))
         return pairs

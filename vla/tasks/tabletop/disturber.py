@@ -49,7 +49,7 @@ class Disturber:
 
     def __init__(self, drawn: Disturbance, scene: CompiledScene) -> None:
         """Take what was drawn for the episode, and the scene."""
-        self._drawn, self._scene = drawn, scene
+        self._disturbance, self._scene = drawn, scene
         self._steps_left = 0  # of a push or a drop
         self._possible_for = 0  # [steps]
         self.motion: Array | None = None
@@ -75,88 +75,88 @@ class Disturber:
             self.offset = self.offset if self.motion is None else self.offset + self.motion
             return False
         self.motion, self.offset, self.opens = None, np.zeros(3), False
-        if len(self.events) == self._drawn.times or not self._possible(state, now):
+        if len(self.events) == self._disturbance.times or not self._is_possible(state, now):
             return False
         self._possible_for += 1
-        if self._possible_for <= self._drawn.delay or not (description := self._happen(state, now)):
+        if self._possible_for <= self._disturbance.delay or not (description := self._happen(state, now)):
             return False
         self._possible_for = 0
         self.events.append((step, description))
-        return self._drawn.kind.startswith("move")
+        return self._disturbance.kind.startswith("move")
 
-    def _possible(self, state: WorldState, now: Subgoal) -> bool:
+    def _is_possible(self, state: WorldState, subgoal: Subgoal) -> bool:
         """Return whether the preconditions of the disturbance hold in this state."""
-        kind, block = self._drawn.kind, now.block
+        kind, block = self._disturbance.kind, subgoal.block
         if kind == "push":
             return True
-        if now.done or now.skill == "stay":
+        if subgoal.done or subgoal.skill == "stay":
             return False
         if kind == "move_block":
             return bool(np.linalg.norm(state.tool - state.positions[block]) < APPROACH) and state.resting(block)
-        lifted = bool(state.held[block] and state.positions[block, 2] > state.extents[block, 2] + CLEAR)
-        return lifted or bool(kind == "move_target" and now.skill == "push" and state.touched[block])
+        is_lifted = bool(state.held[block] and state.positions[block, 2] > state.extents[block, 2] + CLEAR)
+        return is_lifted or bool(kind == "move_target" and subgoal.skill == "push" and state.touched[block])
 
-    def _happen(self, state: WorldState, now: Subgoal) -> str:
+    def _happen(self, state: WorldState, subgoal: Subgoal) -> str:
         """Start the disturbance and return its description; an empty string if there is no free place."""
-        kind, distance = self._drawn.kind, f"{100 * self._drawn.distance:.1f} cm"
+        kind, distance = self._disturbance.kind, f"{100 * self._disturbance.distance:.1f} cm"
         if kind == "drop":
             self.opens, self._steps_left = True, OPEN_STEPS
             return "drop: the gripper opens"
         if kind == "push":
-            place = next(self._around(state.tool), None)
+            place = next(self._places_around(state.tool), None)
             if place is None:
                 return ""
-            self._steps_left = max(1, math.ceil(self._drawn.distance / PUSH_STEP))
+            self._steps_left = max(1, math.ceil(self._disturbance.distance / PUSH_STEP))
             self.motion = self.offset = np.append(place - state.tool[:2], 0.0) / self._steps_left
             return f"push: the arm is pushed by {distance}"
-        target: Target | None = ("block", now.block) if kind == "move_block" else _target(state, now)
+        target: Target | None = ("block", subgoal.block) if kind == "move_block" else _target(state, subgoal)
         if target is None or (place := self._free_place(state, target)) is None:
             return ""
-        what, index = target
-        (self._scene.place_pad if what == "pad" else self._scene.move_block)(index, *place)
-        return f"{kind}: the {what} is moved by {distance}"
+        object_kind, index = target
+        (self._scene.place_pad if object_kind == "pad" else self._scene.move_block)(index, *place)
+        return f"{kind}: the {object_kind} is moved by {distance}"
 
-    def _around(self, start: Array) -> Iterator[Array]:
+    def _places_around(self, start: Array) -> Iterator[Array]:
         """Yield the places (2,) at the drawn distance from `start` that are in the area, the drawn direction first."""
         for number in range(DIRECTIONS):
-            angle = self._drawn.angle + number * GOLDEN_ANGLE
-            place = start[:2] + self._drawn.distance * np.array([math.cos(angle), math.sin(angle)])
-            if (place >= self._drawn.low).all() and (place <= self._drawn.high).all():
+            angle = self._disturbance.angle + number * GOLDEN_ANGLE
+            place = start[:2] + self._disturbance.distance * np.array([math.cos(angle), math.sin(angle)])
+            if (place >= self._disturbance.low).all() and (place <= self._disturbance.high).all():
                 yield place
 
     def _free_place(self, state: WorldState, target: Target) -> Array | None:
         """Return the first place (2,) for an object away from its neighbours and the gripper, or None."""
-        what, index = target
+        object_kind, index = target
         radii = np.linalg.norm(state.extents, axis=1)  # of the blocks, whatever face is up
         things: dict[Target, tuple[Array, float]] = {
-            ("pad", pad): (at, PAD_RADIUS) for pad, at in enumerate(state.pads)
+            ("pad", pad): (centre, PAD_RADIUS) for pad, centre in enumerate(state.pads)
         }
-        things |= {("block", block): (at, radii[block]) for block, at in enumerate(state.positions)}
+        things |= {("block", block): (centre, radii[block]) for block, centre in enumerate(state.positions)}
         start, radius = things.pop(target)
-        others = [thing for (kind, other), thing in things.items() if kind == "pad" or not state.held[other]]
-        if what == "block" and not _clear_of_gripper(state, index, start):
+        neighbours = [thing for (kind, number), thing in things.items() if kind == "pad" or not state.held[number]]
+        if object_kind == "block" and not _clear_of_gripper(state, index, start):
             return None
-        for place in self._around(start):
-            if all(math.dist(place, at[:2]) > radius + other + GAP for at, other in others) and (
-                what == "pad" or _clear_of_gripper(state, index, place)
+        for place in self._places_around(start):
+            if all(math.dist(place, centre[:2]) > radius + size + GAP for centre, size in neighbours) and (
+                object_kind == "pad" or _clear_of_gripper(state, index, place)
             ):
                 return place
         return None
 
 
-def _target(state: WorldState, now: Subgoal) -> Target | None:
+def _target(state: WorldState, subgoal: Subgoal) -> Target | None:
     """Return the pad, else the other block that rests on the table, at the destination of a subgoal."""
     for pad, place in enumerate(state.pads):
-        if now.skill != "hold" and np.array_equal(place[:2], now.destination[:2]):
+        if subgoal.skill != "hold" and np.array_equal(place[:2], subgoal.destination[:2]):
             return "pad", pad
     for block, place in enumerate(state.positions):
-        if block != now.block and np.array_equal(place[:2], now.destination[:2]) and state.resting(block):
+        if block != subgoal.block and np.array_equal(place[:2], subgoal.destination[:2]) and state.resting(block):
             return "block", block
     return None
 
 
 def _clear_of_gripper(state: WorldState, block: int, place: Array) -> bool:
     """Return whether gripper and held blocks are far from, or above, a block that lies at `place`."""
-    lowest = min([state.tool[2], *(state.positions[:, 2] - state.extents[:, 2])[state.held]])
-    above = lowest > state.positions[block, 2] + state.extents[block, 2] + ABOVE
-    return bool(above or math.dist(state.tool[:2], place[:2]) > BESIDE)
+    bottom = min([state.tool[2], *(state.positions[:, 2] - state.extents[:, 2])[state.held]])
+    is_above = bottom > state.positions[block, 2] + state.extents[block, 2] + ABOVE
+    return bool(is_above or math.dist(state.tool[:2], place[:2]) > BESIDE)

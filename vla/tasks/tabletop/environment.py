@@ -79,9 +79,9 @@ class Tabletop(World):
         """
         super().__init__()
         require_backend()
-        most = len(COLOURS) - goal.absent
-        if not goal.blocks <= blocks <= most:
-            raise UserError(f"task.blocks must be from {goal.blocks} to {most}, one colour each, got {blocks}")
+        max_blocks = len(COLOURS) - goal.absent
+        if not goal.blocks <= blocks <= max_blocks:
+            raise UserError(f"task.blocks must be from {goal.blocks} to {max_blocks}, one colour each, got {blocks}")
         scene = CompiledScene(FileRobot(robot, meshes) if robot else Panda(meshes), blocks, shadows)
         arm, joints = scene.robot.arm, len(scene.joints)
         motion = (TRANSLATION,) * 3 + (ROTATION,) * 3
@@ -92,7 +92,7 @@ class Tabletop(World):
             state_units=("rad",) * joints + ("rad/s",) * joints + ("m",),
             action=("dx", "dy", "dz", "rx", "ry", "rz", "gripper"),
             units=("m", "m", "m", "rad", "rad", "rad", "1"),
-            low=(*(-each for each in motion), 0.0),
+            low=(*(-limit for limit in motion), 0.0),
             high=(*motion, 1.0),
             control_hz=CONTROL_HZ,
             depth=tuple(cameras),
@@ -223,7 +223,7 @@ class Tabletop(World):
         if not self._blind:
             pictures, metres = self.renderer.render(compiled.data)
             if compiled.noise.image:
-                pictures = self._grainy(pictures)
+                pictures = self._add_grain(pictures)
             millimetres = np.rint(metres * np.float32(MILLIMETRES)).astype(np.uint16)
             rgb = dict(zip(self.spec.cameras, pictures, strict=True))
             depth = dict(zip(self.spec.cameras, millimetres, strict=True))
@@ -231,7 +231,7 @@ class Tabletop(World):
             self._image_noise.bytes(3 * len(self.spec.cameras) * math.prod(self.spec.image_size))
         return Observation(rgb, self._state(), self.simulation.instruction, depth, self.simulation.truth())
 
-    def _grainy(self, pictures: Array) -> Array:
+    def _add_grain(self, pictures: Array) -> Array:
         """Add normal noise to pictures (cameras, H, W, 3), in whole grey levels up to 127.
 
         A random byte selects one of 256 equally probable values, in an eighth of the time of drawing normal numbers.

@@ -68,37 +68,37 @@ class Waypoint:
             return self._push(truth)
         if truth["grasped"][0]:
             return self._carry(truth, skill)
-        if skill == "place" and _placed(truth):
-            free = opening > 2 * truth["half_size"][0] + CLEARANCE / 2
-            return self._action(truth, np.array([0.0, 0.0, HOVER if free else 0.0]), 0.0, 1.0)
+        if skill == "place" and _is_placed(truth):
+            is_free = opening > 2 * truth["half_size"][0] + CLEARANCE / 2
+            return self._action(truth, np.array([0.0, 0.0, HOVER if is_free else 0.0]), 0.0, 1.0)
         return self._reach(truth, opening)
 
     def _reach(self, truth: dict[str, Array], opening: float) -> Array:
         tool, block, width = truth["commanded"][:3, 3], truth["block"], 2 * truth["half_size"][0]
         offset = block - tool
         yaw = _yaw_to_faces(truth)
-        away = float(np.hypot(offset[0], offset[1]))
-        between = away < GRASP_XY + 0.004 and abs(offset[2]) < GRASP_Z + 0.004
-        closing = between and width - 0.006 < opening < truth["widest"][0] - 0.004
-        aligned = away < GRASP_XY and abs(offset[2]) < GRASP_Z
-        if closing or (aligned and opening > width - 0.006):
+        distance = float(np.hypot(offset[0], offset[1]))
+        encloses = distance < GRASP_XY + 0.004 and abs(offset[2]) < GRASP_Z + 0.004
+        closes = encloses and width - 0.006 < opening < truth["widest"][0] - 0.004
+        aligned = distance < GRASP_XY and abs(offset[2]) < GRASP_Z
+        if closes or (aligned and opening > width - 0.006):
             return self._action(truth, offset, yaw, 0.0)
         # Descend only straight above the block with open fingers; otherwise stay above it.
-        height = min(FUNNEL * max(away - GRASP_XY / 2, 0.0), HOVER)
+        height = min(FUNNEL * max(distance - GRASP_XY / 2, 0.0), HOVER)
         if opening < width + CLEARANCE:
-            height = max(height, 0.045) if not between else HOVER
+            height = max(height, 0.045) if not encloses else HOVER
         offset[2] += height
-        return self._action(truth, _rising_first(offset), yaw, 1.0)
+        return self._action(truth, _rise_first(offset), yaw, 1.0)
 
     def _carry(self, truth: dict[str, Array], skill: Skill) -> Array:
         offset, tolerance = truth["destination"] - truth["block"], truth["tolerance"][0]
-        away = float(np.hypot(offset[0], offset[1]))
+        distance = float(np.hypot(offset[0], offset[1]))
         if skill == "hold":
             return self._action(truth, offset, 0.0, 0.0)
-        height = min(FUNNEL * max(away - tolerance / 2, 0.0), CARRY)
-        opens = away < tolerance and abs(offset[2]) < PLACE_Z
+        height = min(FUNNEL * max(distance - tolerance / 2, 0.0), CARRY)
+        opens = distance < tolerance and abs(offset[2]) < PLACE_Z
         offset[2] += height
-        return self._action(truth, _rising_first(offset), 0.0, 1.0 if opens else 0.0)
+        return self._action(truth, _rise_first(offset), 0.0, 1.0 if opens else 0.0)
 
     def _push(self, truth: dict[str, Array]) -> Array:
         """Move behind the block, opposite its destination, and push it with closed fingers.
@@ -107,35 +107,35 @@ class Waypoint:
         side and leave the block sideways before they rise, and no excursion begins while they touch it.
         """
         block, (half, _, half_height) = truth["block"], truth["half_size"]
-        fingertip, breadth, below, middle = truth["tip"]
+        fingertip, breadth, depth, middle = truth["tip"]
         beside = truth["commanded"][:3, 1] * middle  # from the tool point to the middle of the closed fingertips
         tool = truth["commanded"][:3, 3] + beside
-        way = (truth["destination"] - block)[:2]
-        distance = float(np.hypot(*way))
-        ahead = way / max(distance, 1e-6)
-        aside = np.array([-ahead[1], ahead[0]])
-        along, across = (tool - block)[:2] @ ahead, (tool - block)[:2] @ aside
-        away, top, low = np.hypot(along, across), block[2] + half_height, below + ABOVE
+        path = (truth["destination"] - block)[:2]
+        distance = float(np.hypot(*path))
+        direction = path / max(distance, 1e-6)
+        normal = np.array([-direction[1], direction[0]])
+        progress, deviation = (tool - block)[:2] @ direction, (tool - block)[:2] @ normal
+        separation, top, low = np.hypot(progress, deviation), block[2] + half_height, depth + ABOVE
         yaw, touches = 0.0, False
         if breadth > fingertip:
-            touches = bool(away < np.sqrt(2) * half + fingertip and tool[2] - below < top)
-            yaw, self.info = _yaw_to_way(truth, ahead), {"must_turn": True, "steady": touches}
-        elif away < half + fingertip and low + half_height < tool[2] < top + fingertip:
+            touches = bool(separation < np.sqrt(2) * half + fingertip and tool[2] - depth < top)
+            yaw, self.info = _yaw_to_way(truth, direction), {"must_turn": True, "steady": touches}
+        elif separation < half + fingertip and low + half_height < tool[2] < top + fingertip:
             # The fingers enclose the block: release it and rise.
             return self._action(truth, np.array([0.0, 0.0, HOVER]), 0.0, 1.0)
         height = max(low, min(PUSH_AT * half, 0.9 * half_height))
-        behind = np.sqrt(2) * half + fingertip + 0.006  # for any yaw of the block
-        if tool[2] < height + PUSH_Z and -behind - 0.03 < along < -half and abs(across) < LANE:
-            forward = min(distance, PUSH) * (1 - SLOWER * (across / LANE) ** 2)
-            offset = np.append(forward * ahead - across * aside, height - tool[2])
+        standoff = np.sqrt(2) * half + fingertip + 0.006  # for any yaw of the block
+        if tool[2] < height + PUSH_Z and -standoff - 0.03 < progress < -half and abs(deviation) < LANE:
+            forward = min(distance, PUSH) * (1 - SLOWER * (deviation / LANE) ** 2)
+            offset = np.append(forward * direction - deviation * normal, height - tool[2])
             return self._action(truth, offset + self._swing(beside, yaw), yaw, 0.0)
         if touches:
-            offset = np.append((tool - block)[:2] / max(away, 1e-6) * PUSH, 0.0)
+            offset = np.append((tool - block)[:2] / max(separation, 1e-6) * PUSH, 0.0)
             return self._action(truth, offset, 0.0, 0.0)
-        offset = np.append(block[:2] - (behind + 0.004) * ahead, height) - tool
-        away = float(np.hypot(offset[0], offset[1]))
-        offset[2] += min(FUNNEL * max(away - BEHIND, 0.0), HOVER)
-        return self._action(truth, _rising_first(offset) + self._swing(beside, yaw), yaw, 0.0)
+        offset = np.append(block[:2] - (standoff + 0.004) * direction, height) - tool
+        separation = float(np.hypot(offset[0], offset[1]))
+        offset[2] += min(FUNNEL * max(separation - BEHIND, 0.0), HOVER)
+        return self._action(truth, _rise_first(offset) + self._swing(beside, yaw), yaw, 0.0)
 
     def _swing(self, beside: Array, yaw: float) -> Array:
         """Return the motion (3,) of the tool that keeps the point `beside` it in place while the tool turns."""
@@ -149,23 +149,23 @@ class Waypoint:
         return np.concatenate([offset / scale, vector_from_rotation(upright @ rotation.T), [gripper]])
 
 
-def _rising_first(offset: Array) -> Array:
+def _rise_first(offset: Array) -> Array:
     """Reduce horizontal motion while the tool has to rise, so that it does not hit other blocks."""
     if offset[2] > 0.01:
         offset[:2] *= 0.02 / (0.02 + offset[2])
     return offset
 
 
-def _placed(truth: dict[str, Array]) -> bool:
+def _is_placed(truth: dict[str, Array]) -> bool:
     """Return whether the block is close enough to its destination."""
     offset = truth["destination"] - truth["block"]
     return bool(np.hypot(offset[0], offset[1]) < 1.5 * truth["tolerance"][0] and abs(offset[2]) < PLACE_Z)
 
 
-def _yaw_to_way(truth: dict[str, Array], ahead: Array) -> float:
+def _yaw_to_way(truth: dict[str, Array], direction: Array) -> float:
     """Return the turn [rad] after which the tool's x axis is parallel to a horizontal direction (2,)."""
     rotation, half_turn = truth["commanded"][:3, :3], np.pi
-    turn = np.arctan2(ahead[1], ahead[0]) - np.arctan2(rotation[1, 0], rotation[0, 0])
+    turn = np.arctan2(direction[1], direction[0]) - np.arctan2(rotation[1, 0], rotation[0, 0])
     return float((turn + half_turn / 2) % half_turn - half_turn / 2)
 
 
@@ -176,6 +176,6 @@ def _yaw_to_faces(truth: dict[str, Array]) -> float:
     """
     rotation, (cosine, sine) = truth["commanded"][:3, :3], truth["faces"]
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
-    back = np.clip(yaw, -MAX_YAW, MAX_YAW) - yaw  # turn back into the range of allowed yaws
+    correction = np.clip(yaw, -MAX_YAW, MAX_YAW) - yaw  # turn back into the range of allowed yaws
     quarter = np.pi / 2
-    return float(back + (np.arctan2(sine, cosine) / 4 - back + quarter / 2) % quarter - quarter / 2)
+    return float(correction + (np.arctan2(sine, cosine) / 4 - correction + quarter / 2) % quarter - quarter / 2)

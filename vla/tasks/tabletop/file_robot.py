@@ -63,8 +63,8 @@ class FileRobot(TabletopRobot):
         strength = zip(home, robot_spec.stiffness(spec, home, FREQUENCY), strict=True)  # as much as its inertia allows
         servos = [robot_spec.add_servo(spec, name, k, LEAD * k, None) for name, k in strength]
         grips = [self._grip(name, max(abs(file.open[name] - file.closed[name]), 1e-3)) for name in file.open]
-        self.joints, self.servos, self.grips = ([PREFIX + each for each in names] for names in (home, servos, grips))
-        self.closed, self.opened = (np.array([each[name] for name in file.open]) for each in (file.closed, file.open))
+        self.joints, self.servos, self.grips = ([PREFIX + name for name in names] for names in (home, servos, grips))
+        self.closed, self.opened = (np.array([pose[name] for name in file.open]) for pose in (file.closed, file.open))
         self._measure_gripper(sides)
         self.kinematics = self._kinematics()
         velocities = tuple(f"{joint}_velocity" for joint in file.joints)
@@ -83,8 +83,8 @@ class FileRobot(TabletopRobot):
         spec, force = self._spec, self._file.force
         if spec.actuator(name) is not None:
             return name
-        known = [element.name for element in (*spec.actuators, *spec.joints)]
-        require("open", [name], known, "actuator or joint")
+        names = [element.name for element in (*spec.actuators, *spec.joints)]
+        require("open", [name], names, "actuator or joint")
         robot_spec.set_armature(spec, [name], force * FASTEST**2 / (2 * travel))
         stiffness = force / (SOFTNESS * travel)
         return robot_spec.add_servo(spec, name, stiffness, LEAD * stiffness, force)
@@ -97,9 +97,9 @@ class FileRobot(TabletopRobot):
             sides = fingertips.far_ends(self._spec, self._model, self._data, sides, PREFIX)
             middles = self._close(sides)
         self._require_grasp()
-        aside, deeper = float(np.interp(AROUND_BLOCK, self._openings, middles[:, 1])), max(0.0, self.tip[2] - BELOW)
-        if abs(aside) > BESIDE or deeper:
-            robot_spec.move_tool(self._spec, np.array([0.0, aside, deeper]))
+        shift, depth = float(np.interp(AROUND_BLOCK, self._openings, middles[:, 1])), max(0.0, self.tip[2] - BELOW)
+        if abs(shift) > BESIDE or depth:
+            robot_spec.move_tool(self._spec, np.array([0.0, shift, depth]))
             self.tip = self._extents(float(self._close(sides)[0, 1]))
         for side in sides:
             fingertips.soften(self._spec, side)
@@ -127,9 +127,9 @@ class FileRobot(TabletopRobot):
         Returns the middle between the fingertips, the geoms `sides`, in the frame of the tool, for openings in
         ascending order, (N, 3) [m].
         """
-        alone = mujoco.MjSpec.from_string(f"<mujoco><option {attributes(**PHYSICS)}/></mujoco>")
-        self.complete(alone)
-        self._model = model = compiled(alone)
+        scene = mujoco.MjSpec.from_string(f"<mujoco><option {attributes(**PHYSICS)}/></mujoco>")
+        self.complete(scene)
+        self._model = model = compiled(scene)
         self._data = data = mujoco.MjData(model)
         self.fingertips, self.tool = [[PREFIX + tip for tip in side] for side in sides], PREFIX + robot_spec.TOOL
         names = [model.joint(index).name for index in range(model.njnt)]
@@ -143,8 +143,8 @@ class FileRobot(TabletopRobot):
             mujoco.mj_step(model, data, SETTLING)
             mujoco.mj_kinematics(model, data)
             opening, middle = fingertips.gap(model, data, self.fingertips)
-            inside = (middle - tool.xpos) @ tool.xmat.reshape(3, 3)
-            rows.append([opening, *inside, *(data.joint(name).qpos[0] for name in self.fingers)])
+            point = (middle - tool.xpos) @ tool.xmat.reshape(3, 3)
+            rows.append([opening, *point, *(data.joint(name).qpos[0] for name in self.fingers)])
         table = np.array(rows)[::-1]
         self._openings, self._positions = np.maximum.accumulate(table[:, 0]), table[:, 4:]
         self._commands, self.narrowest, self.widest = commands[::-1], *self._openings[[0, -1]].tolist()
@@ -155,8 +155,8 @@ class FileRobot(TabletopRobot):
         """Return the extents of the closed fingertips about `middle` on the tool's y axis, see `tip`."""
         tips = [tip for side in self.fingertips for tip in side]
         corners = fingertips.points(self._model, self._data, tips, self._data.site(self.tool))
-        forward, aside = np.abs(corners[:, :2] - [0.0, middle]).max(axis=0)
-        return float(forward), float(aside), float(corners[:, 2].max()), middle
+        half_length, half_width = np.abs(corners[:, :2] - [0.0, middle]).max(axis=0)
+        return float(half_length), float(half_width), float(corners[:, 2].max()), middle
 
     def grip(self, opening: float) -> tuple[Array, float]:
         """Interpolate in the table of the gripper."""
@@ -195,6 +195,6 @@ class FileRobot(TabletopRobot):
             mujoco.mju_quat2Mat(rotation, turn)
             frames.append(np.eye(4))
             frames[-1][:3, :3], frames[-1][:3, 3] = rotation.reshape(3, 3), self._data.xanchor[index]
-        links = (np.linalg.inv(before) @ frame for before, frame in pairwise([*frames, tool]))
+        links = (np.linalg.inv(parent) @ frame for parent, frame in pairwise([*frames, tool]))
         rows = ([*link[:3, 3], *robot_spec.quaternion(link[:3, :3])] for link in links)
         return tuple(tuple(np.round(row, 9).tolist()) for row in rows)

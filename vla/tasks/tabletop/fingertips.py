@@ -27,7 +27,7 @@ FAR = 1.0  # largest gap that is measured [m]
 
 def named(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
     """Return the names of colliding geoms in `names` and in the bodies `names`; a site becomes a geom of its shape."""
-    geoms, bodies, sites = ({each.name: each for each in kind} for kind in (spec.geoms, spec.bodies, spec.sites))
+    geoms, bodies, sites = ({entry.name: entry for entry in kind} for kind in (spec.geoms, spec.bodies, spec.sites))
     require("fingertips", names, (*geoms, *bodies, *sites), "geom, body or site")
     tips: list[Any] = []
     for name in names:
@@ -54,7 +54,7 @@ def soften(spec: mujoco.MjSpec, tips: Sequence[str]) -> None:
     """Give shapes the contact parameters of fingertips."""
     for tip in map(spec.geom, tips):
         tip.friction, tip.condim, tip.priority, tip.solref = (
-            FINGERTIP_CONTACT[each] for each in ("friction", "condim", "priority", "solref")
+            FINGERTIP_CONTACT[key] for key in ("friction", "condim", "priority", "solref")
         )
         tip.solimp[:3] = FINGERTIP_CONTACT["solimp"]
 
@@ -62,13 +62,13 @@ def soften(spec: mujoco.MjSpec, tips: Sequence[str]) -> None:
 def gap(model: mujoco.MjModel, data: mujoco.MjData, sides: Sequence[Sequence[str]]) -> tuple[float, Array]:
     """Return the smallest distance between the geoms of both sides, at least 0, and the middle (3,) of the gap [m]."""
     left, right = ([model.geom(name).id for name in side] for side in sides)
-    nearest, ends = FAR, np.zeros(6)
+    minimum, ends = FAR, np.zeros(6)
     for first, second in product(left, right):
-        between = np.zeros(6)
-        distance = mujoco.mj_geomDistance(model, data, first, second, FAR, between)
-        if distance < nearest:
-            nearest, ends = distance, between
-    return max(0.0, nearest), (ends[:3] + ends[3:]) / 2
+        segment = np.zeros(6)
+        distance = mujoco.mj_geomDistance(model, data, first, second, FAR, segment)
+        if distance < minimum:
+            minimum, ends = distance, segment
+    return max(0.0, minimum), (ends[:3] + ends[3:]) / 2
 
 
 def points(model: mujoco.MjModel, data: mujoco.MjData, tips: Sequence[str], place: Any) -> Array:
@@ -112,19 +112,19 @@ def far_ends(
             body = data.body(prefix + spec.geom(tip).parent.name)
             turn = tool.xmat.reshape(3, 3).T @ body.xmat.reshape(3, 3)
             start = (tool.xpos - body.xpos) @ body.xmat.reshape(3, 3)
-            end, rest = (_beyond(shape, sign * (shape[..., 2] - level)) for sign in (1, -1))
+            end, rest = (_points_above(shape, sign * (shape[..., 2] - level)) for sign in (1, -1))
             if len(end):
                 side.append(_divide(spec, tip, start + end @ turn, start + rest @ turn) if len(rest) else tip)
     return ends
 
 
-def _beyond(triangles: Array, heights: Array) -> Array:
+def _points_above(triangles: Array, heights: Array) -> Array:
     """Return points (N, 3) whose hull is that of the part of triangles (T, 3, 3) with heights (T, 3) above 0."""
     starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
-    here, there = heights.reshape(-1), np.roll(heights, -1, axis=1).reshape(-1)
-    cross = here * there < 0
-    share = (here[cross] / (here[cross] - there[cross]))[:, None]
-    return np.concatenate([starts[here >= 0], starts[cross] + share * (ends[cross] - starts[cross])])
+    start_heights, end_heights = heights.reshape(-1), np.roll(heights, -1, axis=1).reshape(-1)
+    cross = start_heights * end_heights < 0
+    share = (start_heights[cross] / (start_heights[cross] - end_heights[cross]))[:, None]
+    return np.concatenate([starts[start_heights >= 0], starts[cross] + share * (ends[cross] - starts[cross])])
 
 
 def _divide(spec: mujoco.MjSpec, tip: str, end: Array, rest: Array) -> str:
@@ -132,8 +132,8 @@ def _divide(spec: mujoco.MjSpec, tip: str, end: Array, rest: Array) -> str:
     return the name of the hull of `end`, or of the unchanged geom if that hull is flat."""
     if not add_hull(spec, f"{tip}_end", end):
         return tip
-    whole = spec.geom(tip)
-    whole.contype = whole.conaffinity = 0
+    geom = spec.geom(tip)
+    geom.contype = geom.conaffinity = 0
     for name in [f"{tip}_end", *([f"{tip}_rest"] if add_hull(spec, f"{tip}_rest", rest) else [])]:
-        _add(whole.parent, name, mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+        _add(geom.parent, name, mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
     return f"{tip}_end"

@@ -36,24 +36,24 @@ class Grammar:
 
     def __post_init__(self) -> None:
         words, held_out = self.words, self.held_out_words
-        leaked = {*self.phrasings} & {*self.held_out_phrasings}
-        leaked |= {word for slot, new in held_out.items() for word in new if word in words.get(slot, ())}
-        if leaked:
-            raise UserError(f"task.goal.language holds out what training also uses: {sorted(leaked)}")
+        overlap = {*self.phrasings} & {*self.held_out_phrasings}
+        overlap |= {word for slot, terms in held_out.items() for word in terms if word in words.get(slot, ())}
+        if overlap:
+            raise UserError(f"task.goal.language holds out what training also uses: {sorted(overlap)}")
         if not self.held_out_phrasings or not held_out:
             raise UserError("task.goal.language.held_out_phrasings and held_out_words must not be empty")
         if not any(f"{{{slot}}}" in phrasing for phrasing in self.phrasings for slot in held_out):
             raise UserError("task.goal.language.held_out_words has no slot of the phrasings, so it replaces no word")
-        every = (*self.phrasings, *self.held_out_phrasings)
-        self.slots = {slot for phrasing in every for slot in _slots(phrasing)} - {*words}
+        phrasings = (*self.phrasings, *self.held_out_phrasings)
+        self.slots = {slot for phrasing in phrasings for slot in _slots(phrasing)} - {*words}
 
     def renamed(self, slots: Mapping[str, str]) -> Grammar:
         """Return the grammar with other names for some slots, old → new, which are replaced in that order."""
         grammar = copy(self)
         for old, new in slots.items():
             for name in ("phrasings", "held_out_phrasings"):
-                renamed = (phrasing.replace(f"{{{old}}}", f"{{{new}}}") for phrasing in getattr(grammar, name))
-                setattr(grammar, name, tuple(renamed))
+                phrasings = (phrasing.replace(f"{{{old}}}", f"{{{new}}}") for phrasing in getattr(grammar, name))
+                setattr(grammar, name, tuple(phrasings))
         grammar.slots = {slots.get(slot, slot) for slot in self.slots}
         return grammar
 
@@ -67,13 +67,13 @@ class Grammar:
         """Draw an instruction with the goal's `slots` filled; one part of it is held out, or nothing if None."""
         phrasings = self.held_out_phrasings if held_out == "phrasings" else self.phrasings
         if held_out == "words":  # only phrasings that have a word to replace
-            phrasings = tuple(one for one in phrasings if any(f"{{{slot}}}" in one for slot in self.held_out_words))
+            phrasings = tuple(text for text in phrasings if any(f"{{{slot}}}" in text for slot in self.held_out_words))
         phrasing = phrasings[random_state.randint(len(phrasings))]
         words = {**self.words, **(self.held_out_words if held_out == "words" else {})}
-        chosen = {
+        fillers = {
             slot: words[slot][random_state.randint(len(words[slot]))] for slot in sorted(_slots(phrasing) & set(words))
         }
-        return phrasing.format(**chosen, **slots)
+        return phrasing.format(**fillers, **slots)
 
 
 class Silence(Grammar):

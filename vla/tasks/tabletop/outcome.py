@@ -40,14 +40,14 @@ class OutcomeClassifier:
     def update(self, state: WorldState, subgoals: Sequence[Subgoal], named: Sequence[int]) -> None:
         """Update with one step: its state, its subgoals, the indices of the named blocks."""
         self._held_for = self._held_for + 1 if all(subgoal.done for subgoal in subgoals) else 0
-        now = current(subgoals)
-        block, self._skill = now.block, now.skill
+        subgoal = current(subgoals)
+        block, self._skill = subgoal.block, subgoal.skill
         if block != self._block:
             self._block, self._near, self._lifted, self._holding, self._dropped = block, False, False, False, False
-        near = PUSH if now.skill == "push" else REACH
-        self._near |= bool(np.linalg.norm(state.tool - state.positions[block]) < near)
+        reach = PUSH if subgoal.skill == "push" else REACH
+        self._near |= bool(np.linalg.norm(state.tool - state.positions[block]) < reach)
         lifted = state.held & (state.positions[:, 2] > state.extents[:, 2] + CLEAR)
-        self._lifted_other |= any(up for index, up in enumerate(lifted) if index not in named)
+        self._lifted_other |= any(is_lifted for index, is_lifted in enumerate(lifted) if index not in named)
         if lifted[block]:
             self._lifted = self._holding = True
             self._dropped = False

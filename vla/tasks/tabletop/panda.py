@@ -155,9 +155,9 @@ def _assets(meshes: str) -> str:
 
 
 def _geoms(mesh: str, rgba: tuple[float, ...], collides: bool = True) -> str:
-    seen = f'mesh="{mesh}_seen" contype="0" conaffinity="0" {attributes(group=VISIBLE, rgba=rgba)}'
+    visual = f'mesh="{mesh}_seen" contype="0" conaffinity="0" {attributes(group=VISIBLE, rgba=rgba)}'
     solid = f'mesh="{mesh}" {attributes(group=HIDDEN, **ROBOT_CONTACT)}'
-    return "".join(f'<geom type="mesh" mass="0" {each}/>' for each in (seen, solid)[: 1 + collides])
+    return "".join(f'<geom type="mesh" mass="0" {text}/>' for text in (visual, solid)[: 1 + collides])
 
 
 def _finger(side: str, turn: float) -> str:

@@ -58,12 +58,12 @@ def look_at(position: Sequence[float] | Array, target: Sequence[float] | Array, 
 
 def spread(points: Array) -> Array:
     """Select at most `CORNERS` of the (N, 3) points by farthest-point sampling."""
-    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
-    nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < min(CORNERS, len(points)):
-        chosen.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return points[chosen]
+    indices = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
+    distances = np.linalg.norm(points - points[indices[0]], axis=1)
+    while len(indices) < min(CORNERS, len(points)):
+        indices.append(int(distances.argmax()))
+        distances = np.minimum(distances, np.linalg.norm(points - points[indices[-1]], axis=1))
+    return points[indices]
 
 
 class TabletopRobot:

@@ -94,15 +94,15 @@ class InstalledRobot(RobotFile):
     def __init__(self, file: Text, hand: Text | None, **inherited: Inherited) -> None:
         """Take paths that begin with the name of a package, such as dm_control/third_party/kinova/jaco_arm.xml
         (UserError: no such package, or a path out of it)."""
-        super().__init__(file=_installed(file), hand=_installed(hand) if hand else None, **inherited)
+        super().__init__(file=_package_file(file), hand=_package_file(hand) if hand else None, **inherited)
 
 
-def _installed(path: str) -> Path:
+def _package_file(path: str) -> Path:
     """Return a file or folder in a package; one in the working folder, which Python also finds, is not installed."""
-    package, _, rest = path.partition("/")
-    found = find_spec(package) if package.isidentifier() else None
-    source = Path(found.origin).absolute() if found and found.origin else Path()
-    file = Path(normpath(source.parent / rest))
+    package, _, subpath = path.partition("/")
+    spec = find_spec(package) if package.isidentifier() else None
+    source = Path(spec.origin).absolute() if spec and spec.origin else Path()
+    file = Path(normpath(source.parent / subpath))
     if source.name != "__init__.py" or source.parents[1] == Path.cwd() or source.parent not in file.parents:
         raise UserError(f"task.robot: {path} must begin with the name of an installed package and stay within it")
     return file
@@ -111,51 +111,51 @@ def _installed(path: str) -> Path:
 def read(file: Path, key: str) -> mujoco.MjSpec:
     """Read a model, with absolute paths of its meshes and without its textures; `key` names the file in errors
     (UserError: there is no such file, no such mesh, or MuJoCo does not compile it)."""
-    path, named = Path(file).absolute(), f"task.robot.{key}={file}"
+    path, label = Path(file).absolute(), f"task.robot.{key}={file}"
     if not path.is_file():
-        raise UserError(f"{named}: there is no such file")
+        raise UserError(f"{label}: there is no such file")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, mujoco.FatalError) as error:
-        raise UserError(f"{named} does not compile: {' '.join(str(error).split())}") from error
+        raise UserError(f"{label} does not compile: {' '.join(str(error).split())}") from error
     for mesh in spec.meshes:
         if mesh.file:
             name = Path(mesh.file).name if spec.strippath else mesh.file
-            located = _located(named, name, path.parent / (spec.compiler.meshdir or ""), path)
-            require_file(located)
-            mesh.file = str(located)
+            mesh_file = _mesh_file(label, name, path.parent / (spec.compiler.meshdir or ""), path)
+            require_file(mesh_file)
+            mesh.file = str(mesh_file)
     spec.compiler.meshdir = ""
-    _drop_textures(spec, named, path)
-    plain = mujoco.MjSpec()
-    for name in (*OF_THE_WORLD, *(name for name in dir(plain) if name.startswith("nuser_"))):
-        setattr(spec, name, getattr(plain, name))
+    _drop_textures(spec, label, path)
+    defaults = mujoco.MjSpec()
+    for name in (*OF_THE_WORLD, *(name for name in dir(defaults) if name.startswith("nuser_"))):
+        setattr(spec, name, getattr(defaults, name))
     # URDF: keep shapes that do not collide, and links that do not move, of which the tool may be one.
     spec.compiler.discardvisual = spec.compiler.fusestatic = False
-    compiled(spec, named)
+    compiled(spec, label)
     return spec
 
 
-def _located(named: str, mesh: str, folder: Path, model: Path) -> Path:
+def _mesh_file(label: str, mesh: str, folder: Path, model: Path) -> Path:
     """Return the file of a mesh, given by a path in a folder or by a URI as in ROS (UserError: a URI of another scheme,
     or of a package that is not found)."""
     if "://" not in mesh:
         return folder / mesh
     try:
-        kind, package, rest, *_ = urlsplit(mesh)
+        kind, package, location, *_ = urlsplit(mesh)
     except ValueError as error:  # such as a bracket
-        raise UserError(f"{named} has a mesh at {mesh}, which is no address: {error}") from error
-    inside = unquote(rest).lstrip("/")
+        raise UserError(f"{label} has a mesh at {mesh}, which is no address: {error}") from error
+    subpath = unquote(location).lstrip("/")
     if kind == "file":
-        return Path("/", inside)
+        return Path("/", subpath)
     if kind != "package":
-        raise UserError(f"{named} has a mesh at {mesh}: meshes are at package://, file:// or a path")
-    installed = (prefix / "share" for prefix in _folders("AMENT_PREFIX_PATH"))
-    sources = (each for folder in _folders("ROS_PACKAGE_PATH") for each in (folder, folder.parent))
-    for parent in chain(model.parents, installed, sources):
+        raise UserError(f"{label} has a mesh at {mesh}: meshes are at package://, file:// or a path")
+    shares = (prefix / "share" for prefix in _folders("AMENT_PREFIX_PATH"))
+    sources = (source for folder in _folders("ROS_PACKAGE_PATH") for source in (folder, folder.parent))
+    for parent in chain(model.parents, shares, sources):
         if (parent / package).is_dir():
-            return parent / package / inside
+            return parent / package / subpath
     raise UserError(
-        f"{named} has a mesh at {mesh}: no folder {package} is above the file, in AMENT_PREFIX_PATH or in "
+        f"{label} has a mesh at {mesh}: no folder {package} is above the file, in AMENT_PREFIX_PATH or in "
         "ROS_PACKAGE_PATH"
     )
 
@@ -164,12 +164,12 @@ def _folders(variable: str) -> list[Path]:
     return [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
 
 
-def _drop_textures(spec: mujoco.MjSpec, named: str, path: Path) -> None:
+def _drop_textures(spec: mujoco.MjSpec, label: str, path: Path) -> None:
     """Remove the textures of a model, which are not drawn, so that their files need not exist."""
     text = path.read_bytes()
     in_urdf = b"<robot" in text and b"<texture" in text  # MuJoCo itself ignores these
     if in_urdf or any(texture.file or any(texture.cubefiles) for texture in spec.textures):
-        _say(f"{named}: its textures are left out, and shapes have the colours of their materials")
+        _say(f"{label}: its textures are left out, and shapes have the colours of their materials")
     for material in spec.materials:
         material.textures = [""] * len(material.textures)
     for texture in [*spec.textures]:
@@ -192,9 +192,9 @@ def compiled(spec: mujoco.MjSpec, named: str = "task.robot") -> mujoco.MjModel:
 
 def require(key: str, names: Iterable[str], known: Iterable[str], kind: str) -> None:
     """Raise a UserError, which lists the known elements of this `kind`, if one of `names` is not among them."""
-    there = [name for name in known if name]
+    elements = [name for name in known if name]
     for name in names:
-        if name not in there:
-            listed = ", ".join(there[:LISTED]) + (", …" if len(there) > LISTED else "")
-            hint = suggestion(name, there) or ":"
-            raise UserError(f"task.robot.{key} names {name}, which is no {kind}{hint} there are {listed or 'none'}")
+        if name not in elements:
+            listing = ", ".join(elements[:LISTED]) + (", …" if len(elements) > LISTED else "")
+            hint = suggestion(name, elements) or ":"
+            raise UserError(f"task.robot.{key} names {name}, which is no {kind}{hint} there are {listing or 'none'}")

@@ -31,12 +31,12 @@ def checked_home(spec: mujoco.MjSpec, joints: Names, home: Sequence[float]) -> d
     if len(home) != len(joints):
         raise UserError(f"task.robot.home has {len(home)} positions for {len(joints)} joints")
     model = compiled(spec)
-    carried = set(range(model.nbody))
+    subtree = set(range(model.nbody))
     for name, position in zip(joints, home, strict=True):
         joint = model.joint(name)
-        if int(joint.bodyid[0]) not in carried:
+        if int(joint.bodyid[0]) not in subtree:
             raise UserError(f"task.robot.joints names {name} after a joint that does not carry it: base to tip")
-        carried = descendants(model, int(joint.bodyid[0]))
+        subtree = descendants(model, int(joint.bodyid[0]))
         if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
             raise UserError(f"task.robot.joints names {name}, which is not a hinge")
         low, high = joint.range
@@ -47,11 +47,11 @@ def checked_home(spec: mujoco.MjSpec, joints: Names, home: Sequence[float]) -> d
 
 def descendants(model: mujoco.MjModel, body: int) -> set[int]:
     """Return a body and all bodies that it carries."""
-    found = {body}
+    bodies = {body}
     for child in range(body + 1, model.nbody):  # parents come before their children
-        if model.body_parentid[child] in found:
-            found.add(child)
-    return found
+        if model.body_parentid[child] in bodies:
+            bodies.add(child)
+    return bodies
 
 
 def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str]) -> None:
@@ -73,8 +73,8 @@ def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str
     fixed = {j.name: j for j in spec.joints if j.name not in joints and model.jnt_bodyid[j.id] not in hand}
     slack = _drop_couplings(spec, model, fixed)
     for element in [*spec.actuators]:
-        moved = slack if element.trntype == mujoco.mjtTrn.mjTRN_TENDON else fixed
-        if element.name not in grips or element.target in moved:
+        targets = slack if element.trntype == mujoco.mjtTrn.mjTRN_TENDON else fixed
+        if element.name not in grips or element.target in targets:
             spec.delete(element)
     for element in (*fixed.values(), *spec.lights, *spec.cameras, *spec.sensors, *spec.keys, *spec.pairs, *spec.tuples):
         spec.delete(element)
@@ -87,10 +87,10 @@ def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str
 
 def _drop_couplings(spec: mujoco.MjSpec, model: mujoco.MjModel, fixed: Collection[str]) -> set[str]:
     """Delete tendons and constraints of `fixed` joints, or within bodies that move as one; return the tendon names."""
-    moved = {int(model.jnt_bodyid[joint.id]) for joint in spec.joints if joint.name not in fixed}
+    moving_bodies = {int(model.jnt_bodyid[joint.id]) for joint in spec.joints if joint.name not in fixed}
     part = np.arange(model.nbody)  # the first of the bodies that move as one with a body
     for body in range(1, model.nbody):
-        part[body] = body if body in moved else part[model.body_parentid[body]]
+        part[body] = body if body in moving_bodies else part[model.body_parentid[body]]
     slack: set[str] = set()
     for tendon in [*spec.tendons]:
         targets = [wrap.target for wrap in tendon.path if wrap.target is not None]  # all joints, or all sites or geoms
@@ -101,13 +101,13 @@ def _drop_couplings(spec: mujoco.MjSpec, model: mujoco.MjModel, fixed: Collectio
         if useless:
             slack.add(tendon.name)
             spec.delete(tendon)
-    deleted = {Eq.mjEQ_JOINT: fixed, Eq.mjEQ_TENDON: slack}
+    deleted_names = {Eq.mjEQ_JOINT: fixed, Eq.mjEQ_TENDON: slack}
     for tie, *ends in zip([*spec.equalities], model.eq_obj1id, model.eq_obj2id, strict=True):
         if tie.type in (Eq.mjEQ_CONNECT, Eq.mjEQ_WELD):
             bodies = model.site_bodyid[ends] if tie.objtype == mujoco.mjtObj.mjOBJ_SITE else ends
             useless = part[bodies[0]] == part[bodies[1]]
         else:
-            useless = not {tie.name1, tie.name2}.isdisjoint(deleted.get(tie.type, ()))
+            useless = not {tie.name1, tie.name2}.isdisjoint(deleted_names.get(tie.type, ()))
         if useless:
             spec.delete(tie)
     return slack
@@ -187,8 +187,8 @@ def add_tool(
     _, data = at_home(spec, home)
     site = spec.site(name)
     body = site.parent if site is not None else spec.body(name)
-    at, around = data.site(name) if site is not None else data.body(name), data.body(body.id)
-    axes = (base @ at.xmat.reshape(3, 3)).T @ DOWN  # columns: forward, right, down as seen from it
+    origin, parent = data.site(name) if site is not None else data.body(name), data.body(body.id)
+    axes = (base @ origin.xmat.reshape(3, 3)).T @ DOWN  # columns: forward, right, down as seen from it
     turn = np.round(axes)
     if np.abs(axes).max(axis=0).min() < ALIGNED or abs(np.linalg.det(turn) - 1) > 0.1:
         raise UserError(
@@ -196,9 +196,9 @@ def add_tool(
             f"{np.degrees(np.arccos(ALIGNED)):.0f} degrees; in its frame down is {np.round(axes[:, 2], 2).tolist()}, "
             f"forward {np.round(axes[:, 0], 2).tolist()}"
         )
-    frame = around.xmat.reshape(3, 3)
-    rotation = frame.T @ at.xmat.reshape(3, 3) @ turn
-    position = frame.T @ (at.xpos - around.xpos) + rotation @ offset
+    frame = parent.xmat.reshape(3, 3)
+    rotation = frame.T @ origin.xmat.reshape(3, 3) @ turn
+    position = frame.T @ (origin.xpos - parent.xpos) + rotation @ offset
     body.add_site(name=TOOL, pos=position, quat=quaternion(rotation), size=(0.004,) * 3, group=4, material="")
     return body, position, rotation
 
@@ -212,10 +212,10 @@ def add_camera(body: Any, position: Array, rotation: Array, camera: Array, targe
 
 def move_tool(spec: mujoco.MjSpec, shift: Array) -> None:
     """Move the tool, with its camera, by `shift` (3,) in its own frame [m]."""
-    tool, moved = spec.site(TOOL), np.empty(3)
-    mujoco.mju_rotVecQuat(moved, shift, tool.quat)
-    for each in (tool, spec.camera(WRIST)):
-        each.pos = each.pos + moved
+    tool, offset = spec.site(TOOL), np.empty(3)
+    mujoco.mju_rotVecQuat(offset, shift, tool.quat)
+    for element in (tool, spec.camera(WRIST)):
+        element.pos = element.pos + offset
 
 
 def use_convex_hulls(spec: mujoco.MjSpec) -> None:
@@ -229,10 +229,10 @@ def use_convex_hulls(spec: mujoco.MjSpec) -> None:
             vertices = mesh_triangles(model, index)[0].astype(float) @ turn.reshape(3, 3).T + model.mesh_pos[index]
             hulls[hull] = add_hull(spec, hull, vertices)
         if hulls[hull] and (geom.contype or geom.conaffinity):
-            seen = geom.parent.add_geom(name=f"{geom.name}_seen", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=hull)
-            seen.pos, seen.quat = _frame_of(model, geom)
-            seen.rgba, seen.group = geom.rgba, VISIBLE
-            seen.material, seen.mass, seen.contype, seen.conaffinity = "", 0.0, 0, 0
+            visual = geom.parent.add_geom(name=f"{geom.name}_seen", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=hull)
+            visual.pos, visual.quat = _frame_of(model, geom)
+            visual.rgba, visual.group = geom.rgba, VISIBLE
+            visual.material, visual.mass, visual.contype, visual.conaffinity = "", 0.0, 0, 0
             geom.group = HIDDEN
         elif hulls[hull]:
             geom.meshname = hull
@@ -243,12 +243,12 @@ def _frame_of(model: mujoco.MjModel, geom: Any) -> tuple[Array, Array]:
 
     An element of a spec has these as they were written: without the frames around it, and by angles or axes.
     """
-    placed, mesh = model.geom(geom.name), model.mesh(geom.meshname)
-    back, turn, off = np.empty(4), np.empty(4), np.empty(3)
-    mujoco.mju_negQuat(back, model.mesh_quat[mesh.id])  # the compiled geom is in the mesh's frame of inertia
-    mujoco.mju_mulQuat(turn, placed.quat, back)
-    mujoco.mju_rotVecQuat(off, model.mesh_pos[mesh.id], turn)
-    return placed.pos - off, turn
+    compiled_geom, mesh = model.geom(geom.name), model.mesh(geom.meshname)
+    inverse, turn, offset = np.empty(4), np.empty(4), np.empty(3)
+    mujoco.mju_negQuat(inverse, model.mesh_quat[mesh.id])  # the compiled geom is in the mesh's frame of inertia
+    mujoco.mju_mulQuat(turn, compiled_geom.quat, inverse)
+    mujoco.mju_rotVecQuat(offset, model.mesh_pos[mesh.id], turn)
+    return compiled_geom.pos - offset, turn
 
 
 def add_hull(spec: mujoco.MjSpec, name: str, points: Array) -> bool:

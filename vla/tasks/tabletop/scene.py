@@ -47,12 +47,12 @@ def compile_scene(robot: TabletopRobot, blocks: int, shadows: bool) -> mujoco.Mj
         body = scene.worldbody.add("body", name=name)
         body.add("freejoint")
         body.add("geom", name=name, type="box", size=(BLOCK_HALF_SIZE,) * 3, group=VISIBLE, **material)
-    spec = _exported(scene)
+    spec = _export(scene)
     robot.complete(spec)
     return compiled(spec)
 
 
-def _exported(scene: mjcf.RootElement) -> mujoco.MjSpec:
+def _export(scene: mjcf.RootElement) -> mujoco.MjSpec:
     """Return a scene for MuJoCo, without the bodies around attached models and the names that PyMJCF adds to it."""
     tree = ElementTree.fromstring(scene.to_xml_string())
     for element in tree.iter():

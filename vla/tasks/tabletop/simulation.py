@@ -94,7 +94,7 @@ class Simulation:
         self._command = np.append(self.controller.joints, compiled.grip)
         data.ctrl[:] = compiled.controls(self._command[None])[0]
         delay = round(compiled.latency / self._timestep)
-        self._late = np.tile(data.ctrl, (delay, 1))  # controls that are delayed by the latency, oldest first
+        self._late_controls = np.tile(data.ctrl, (delay, 1))  # controls that are delayed by the latency, oldest first
         self._axes = draws
         self._start()
         compiled.forward_without_servos()
@@ -105,34 +105,34 @@ class Simulation:
             return [self._request(goal, None, seed)]
         present, skip = self.compiled.present, self.compiled.skip
         links = [
-            (link, replace(named, blocks=tuple((block + skip) % present for block in named.blocks)))
-            for link, named in goal.plan(present, self.streams(seed, "chain"))
+            (link, replace(referents, blocks=tuple((block + skip) % present for block in referents.blocks)))
+            for link, referents in goal.plan(present, self.streams(seed, "chain"))
         ]
         return [self._request(*link, seed, f" {number}") for number, link in enumerate(links, start=1)]
 
     def _request(self, goal: Goal, referents: Referents | None, seed: int, stream: str = "") -> Request:
         """Draw an instruction and, unless given, what it names; `stream` is added to the names of random streams."""
-        held_out = self._held_out(goal, self.streams(seed, f"novelty{stream}"), seed)
+        held_out = self._draw_held_out(goal, self.streams(seed, f"novelty{stream}"), seed)
         if referents is None:
             referents = self._choose(goal, held_out, self.streams(seed, "named"))
             if self.compiled.skip and not goal.absent:  # another block may change whether its colour is held out
-                held_out = self._held_out_for(goal, referents, held_out)
+                held_out = self._adapt_held_out(goal, referents, held_out)
         words = self._slots(goal, referents, seed)
-        said = goal.language.say(words, held_out, self.streams(seed, f"language{stream}"))
-        if self.compiled.paraphrases and seed >= FIRST_SEED and said:
-            return Request(goal, referents, paraphrase(said, self.compiled.paraphrases, words.values()), "names")
-        return Request(goal, referents, said, held_out or "none")
+        instruction = goal.language.say(words, held_out, self.streams(seed, f"language{stream}"))
+        if self.compiled.paraphrases and seed >= FIRST_SEED and instruction:
+            return Request(goal, referents, paraphrase(instruction, self.compiled.paraphrases, words.values()), "names")
+        return Request(goal, referents, instruction, held_out or "none")
 
     def _start(self) -> None:
         """Start the episode with its first request, and describe its draws."""
-        self._steps, drawn = 0, self.compiled.disturbance
-        self.disturber, self._shove = Disturber(drawn, self.compiled) if drawn else None, np.zeros(3)
+        self._steps, disturbance = 0, self.compiled.disturbance
+        self.disturber, self._shove = Disturber(disturbance, self.compiled) if disturbance else None, np.zeros(3)
         self._begin(0)
-        first, *others = self.requests
-        language: dict[str, Any] = {"instruction": first.instruction, "held_out": first.held_out}
-        if others:
-            language["then"] = [request.instruction for request in others]
-        self.draws = {"named": self._named(), **self._axes, "language": language}
+        first_request, *later_requests = self.requests
+        language: dict[str, Any] = {"instruction": first_request.instruction, "held_out": first_request.held_out}
+        if later_requests:
+            language["then"] = [request.instruction for request in later_requests]
+        self.draws = {"named": self._describe_named(), **self._axes, "language": language}
 
     def _begin(self, number: int) -> None:
         """Start the clock of a request, with the blocks where they are now."""
@@ -148,21 +148,21 @@ class Simulation:
         self.name, self.requests = self.goal.name, [self.requests[self.current]]
         self._start()
 
-    def _held_out(self, goal: Goal, random_state: np.random.RandomState, seed: int) -> HeldOut | None:
+    def _draw_held_out(self, goal: Goal, random_state: np.random.RandomState, seed: int) -> HeldOut | None:
         """Draw which part of the instruction is held out; None in training and in the rest of an evaluation."""
         if seed < FIRST_SEED or random_state.uniform() >= self.compiled.held_out:
             return None
-        present = set() if goal.absent else set(self.compiled.block_names[: self.compiled.present])
-        possible = present & set(goal.language.held_out_colours)
-        kinds = [kind for kind in goal.language.held_out_kinds if kind != "combinations" or possible]
+        colours = set() if goal.absent else set(self.compiled.block_names[: self.compiled.present])
+        candidates = colours & set(goal.language.held_out_colours)
+        kinds = [kind for kind in goal.language.held_out_kinds if kind != "combinations" or candidates]
         return kinds[random_state.randint(len(kinds))] if kinds else None
 
-    def _held_out_for(self, goal: Goal, referents: Referents, drawn: HeldOut | None) -> HeldOut | None:
+    def _adapt_held_out(self, goal: Goal, referents: Referents, kind: HeldOut | None) -> HeldOut | None:
         """Adapt the drawn kind of held-out instruction to another named block, so that exactly one kind applies."""
-        new = self.compiled.block_names[referents.blocks[0]] in goal.language.held_out_colours
-        if new == (drawn == "combinations"):
-            return drawn
-        return "combinations" if new else next((k for k in goal.language.held_out_kinds if k != "combinations"), None)
+        novel = self.compiled.block_names[referents.blocks[0]] in goal.language.held_out_colours
+        if novel == (kind == "combinations"):
+            return kind
+        return "combinations" if novel else next((k for k in goal.language.held_out_kinds if k != "combinations"), None)
 
     def _choose(self, goal: Goal, held_out: HeldOut | None, random_state: np.random.RandomState) -> Referents:
         """Draw the named blocks and pads; the first block has a colour that the instruction may name."""
@@ -184,12 +184,12 @@ class Simulation:
         names = self.compiled.block_names
         slots = {slot: names[index] for slot, index in zip(("block", "other"), referents.blocks, strict=False)}
         if goal.absent:
-            unnamed = {*names[: self.compiled.present], *goal.language.held_out_colours}
-            missing = [name for name in COLOURS if name not in unnamed]
-            slots["absent"] = missing[self.streams(seed, "absent").randint(len(missing))]
+            exclusions = {*names[: self.compiled.present], *goal.language.held_out_colours}
+            candidates = [name for name in COLOURS if name not in exclusions]
+            slots["absent"] = candidates[self.streams(seed, "absent").randint(len(candidates))]
         return slots | {slot: list(PADS)[index] for slot, index in zip(("pad", "rest"), referents.pads, strict=False)}
 
-    def _named(self) -> dict[str, Any]:
+    def _describe_named(self) -> dict[str, Any]:
         """Return the draws of the first named block, for reports on what success depends on."""
         index, compiled = self.referents.blocks[0], self.compiled
         x, y, _ = compiled.block_centres()[index]
@@ -227,13 +227,13 @@ class Simulation:
                 "joints_hz of the simulator to a whole fraction of that"
             )
         if self.disturber:
-            joints, opening = self._disturbed(self.disturber, joints, opening, seconds)
+            joints, opening = self._disturb(self.disturber, joints, opening, seconds)
         self._advance(joints, opening, self.compiled.robot.finger_speed * substeps * self._timestep, substeps)
 
-    def _disturbed(self, disturber: Disturber, joints: Array, opening: float, seconds: float) -> tuple[Array, float]:
+    def _disturb(self, disturber: Disturber, joints: Array, opening: float, seconds: float) -> tuple[Array, float]:
         """Return joint targets and opening under the disturbance; the tool is pushed no faster than by an action."""
-        furthest = PUSH_STEP * CONTROL_HZ * seconds
-        self._shove += np.clip(disturber.offset - self._shove, -furthest, furthest)
+        max_shift = PUSH_STEP * CONTROL_HZ * seconds
+        self._shove += np.clip(disturber.offset - self._shove, -max_shift, max_shift)
         if self._shove.any():
             kinematics = self.compiled.robot.kinematics
             start = kinematics.forward(joints)
@@ -253,11 +253,11 @@ class Simulation:
         # A lead compensates the damping of the servos, so that the arm does not lag.
         targets[:, :-1] += robot.lead / self._timestep * increment[:-1]
         self._command = commands[-1]
-        controls = np.concatenate([self._late, self.compiled.controls(targets)])
-        self._late = controls[substeps:]
+        controls = np.concatenate([self._late_controls, self.compiled.controls(targets)])
+        self._late_controls = controls[substeps:]
         ctrl = data.ctrl
-        for now in controls[:substeps]:
-            ctrl[:] = now
+        for row in controls[:substeps]:
+            ctrl[:] = row
             mujoco.mj_step2(model, data)
             mujoco.mj_step1(model, data)
         self.compiled.require_stable()
@@ -279,9 +279,9 @@ class Simulation:
 
     def world_state(self) -> WorldState:
         """Return the current true state."""
-        now = float(self.compiled.data.time)
-        if self._cached is None or self._cached[0] != now:
-            self._cached = now, self._measure()
+        time = float(self.compiled.data.time)
+        if self._cached is None or self._cached[0] != time:
+            self._cached = time, self._measure()
         return self._cached[1]
 
     def _measure(self) -> WorldState:
@@ -296,8 +296,8 @@ class Simulation:
             extents=compiled.extents[:present],
             speeds=np.linalg.norm(velocities, axis=1),
             lifts=self._lifts,
-            held=np.array([len(touching) == 2 for touching in fingers]),
-            touched=np.array([bool(touching) for touching in fingers]),
+            held=np.array([len(sides) == 2 for sides in fingers]),
+            touched=np.array([bool(sides) for sides in fingers]),
             pads=data.mocap_pos[compiled.zones[: self._pads]].copy(),
             tool=data.site_xpos[compiled.tcp].copy(),
             arm_speed=float(np.abs(data.qvel[compiled.velocities]).max()),
@@ -309,21 +309,21 @@ class Simulation:
         faces: cosine and sine of four times the yaw from the fingers to the block's faces, invariant to quarter turns.
         """
         compiled, state, pose = self.compiled, self.world_state(), self.controller.pose
-        now = current(self.goal.subgoals(state, self.referents))
-        block = compiled.data.geom_xmat[compiled.block_geoms[now.block]].reshape(3, 3)
+        subgoal = current(self.goal.subgoals(state, self.referents))
+        block = compiled.data.geom_xmat[compiled.block_geoms[subgoal.block]].reshape(3, 3)
         edge = block[:, int(np.argmin(np.abs(block[2])))]  # the most horizontal edge, for any face up
         quarters = 4 * (np.arctan2(edge[1], edge[0]) - np.arctan2(pose[1, 0], pose[0, 0]))
         return {
             "tcp": state.tool,
-            "block": state.positions[now.block],
-            "destination": now.destination,
+            "block": state.positions[subgoal.block],
+            "destination": subgoal.destination,
             "commanded": pose.copy(),  # (4, 4)
             "commanded_position": pose[:3, 3].copy(),
             "faces": np.array([np.cos(quarters), np.sin(quarters)]),
-            "half_size": state.extents[now.block],  # (3,)
-            "grasped": np.array([float(state.held[now.block])]),
-            "skill": np.array([float(SKILLS.index(now.skill))]),
-            "tolerance": np.array([now.tolerance]),
+            "half_size": state.extents[subgoal.block],  # (3,)
+            "grasped": np.array([float(state.held[subgoal.block])]),
+            "skill": np.array([float(SKILLS.index(subgoal.skill))]),
+            "tolerance": np.array([subgoal.tolerance]),
             "widest": np.array([compiled.robot.widest]),  # opening of the gripper
             "tip": np.array(compiled.robot.tip),  # (4,) as of `TabletopRobot`
         }

@@ -120,11 +120,11 @@ class Goal(ABC):
     named, moves, blocks, absent, pads = 1, 1, 2, 0, 1
 
     def __init__(self, language: Grammar, hold_steps: Count) -> None:
-        known = ["block", "other"][: self.named] + ["pad", "rest"][: self.pads] + ["absent"] * bool(self.absent)
-        if unknown := sorted(language.slots - set(known)):
-            raise UserError(f"task.goal.language has the slots {unknown}, but {type(self).__name__} fills {known}")
-        if taken := sorted(SLOTS & {*language.words, *language.held_out_words}):
-            raise UserError(f"task.goal.language has words for {', '.join(taken)}, slots that goals fill: rename them")
+        slots = ["block", "other"][: self.named] + ["pad", "rest"][: self.pads] + ["absent"] * bool(self.absent)
+        if extra_slots := sorted(language.slots - set(slots)):
+            raise UserError(f"task.goal.language has the slots {extra_slots}, but {type(self).__name__} fills {slots}")
+        if clash := sorted(SLOTS & {*language.words, *language.held_out_words}):
+            raise UserError(f"task.goal.language has words for {', '.join(clash)}, slots that goals fill: rename them")
         self.language, self.hold_steps = language, hold_steps
 
     @property

@@ -31,13 +31,13 @@ class Mixed:
         Raises:
             UserError: no goal remains, or the shares exceed one.
         """
-        self.goals = _chosen(goals)
+        self.goals = _require_goals(goals)
         if impossible + silent > 1:
             raise UserError(f"task.goal.impossible + task.goal.silent must be at most 1, not {impossible + silent:g}")
         self.impossible, self.silent = impossible, silent
         self.blocks = max(goal.blocks for goal in self.goals.values())
-        kept = [absent_colours_needed(goal.language) for goal in self.goals.values() if impossible]
-        self.absent = max([goal.absent for goal in self.goals.values()] + kept)
+        counts = [absent_colours_needed(goal.language) for goal in self.goals.values() if impossible]
+        self.absent = max([goal.absent for goal in self.goals.values()] + counts)
 
     def draw(self, random_state: np.random.RandomState) -> Goal:
         """Draw a goal, then whether to replace it by `Stay` or `Wait`; the drawn goal does not depend on the shares."""
@@ -65,7 +65,7 @@ class Chain:
     def __init__(self, goals: Mapping[str, Goal | None], length: Annotated[int, Ge(1), Le(9)]) -> None:
         """Take name → goal, or None to omit it, and the number of instructions (UserError: no goal remains, one cannot
         be part of a chain, or there are not enough possible instructions)."""
-        self.goals, self.length = _chosen(goals), length
+        self.goals, self.length = _require_goals(goals), length
         for name, goal in self.goals.items():
             if type(goal).after is Goal.after:
                 raise UserError(f"task.goal.goals.{name} cannot be part of a chain (no `after`): set it to null")
@@ -84,7 +84,7 @@ class Chain:
     def plan(self, blocks: int, random_state: np.random.RandomState) -> list[Link]:
         """Draw the goals and what they name, with `blocks` blocks on the table; every goal that is possible is equally
         likely (UserError: there is no such chain)."""
-        links = self._continued([], Arrangement(), blocks, random_state)
+        links = self._complete([], Arrangement(), blocks, random_state)
         if links is None:
             raise UserError(
                 f"{', '.join(self.goals)} give no chain of {self.length} instructions with {blocks} blocks: lower "
@@ -92,31 +92,31 @@ class Chain:
             )
         return links
 
-    def _continued(
+    def _complete(
         self, links: list[Link], arrangement: Arrangement, blocks: int, random_state: np.random.RandomState
     ) -> list[Link] | None:
         """Return the links completed to a whole chain, or None if that is impossible."""
         if len(links) == self.length:
             return links
-        for goal in _shuffled(list(self.goals.values()), random_state):
-            named = permutations(range(blocks), goal.named)
+        for goal in _shuffle(list(self.goals.values()), random_state):
+            choices = permutations(range(blocks), goal.named)
             pads = list(permutations(range(goal.pads)))
-            for referents in _shuffled([Referents(one, other) for one in named for other in pads], random_state):
-                after = goal.after(arrangement, referents)
-                if after is not None:
-                    found = self._continued([*links, (goal, referents)], after, blocks, random_state)
-                    if found is not None:
-                        return found
+            for referents in _shuffle([Referents(choice, order) for choice in choices for order in pads], random_state):
+                successor = goal.after(arrangement, referents)
+                if successor is not None:
+                    chain = self._complete([*links, (goal, referents)], successor, blocks, random_state)
+                    if chain is not None:
+                        return chain
         return None
 
 
-def _chosen(goals: Mapping[str, Goal | None]) -> dict[str, Goal]:
+def _require_goals(goals: Mapping[str, Goal | None]) -> dict[str, Goal]:
     """Return the goals that are not None; a UserError if there is none."""
-    chosen = {name: goal for name, goal in goals.items() if goal is not None}
-    if not chosen:
+    result = {name: goal for name, goal in goals.items() if goal is not None}
+    if not result:
         raise UserError("task.goal.goals names no goal")
-    return chosen
+    return result
 
 
-def _shuffled(values: Sequence[T], random_state: np.random.RandomState) -> list[T]:
+def _shuffle(values: Sequence[T], random_state: np.random.RandomState) -> list[T]:
     return [values[index] for index in random_state.permutation(len(values))]

@@ -49,12 +49,12 @@ class PickPlace(Goal):
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
         """Place the block on the pad's centre."""
-        return [self._placed(state, referents.blocks[0], referents.pads[0])]
+        return [self._place_subgoal(state, referents.blocks[0], referents.pads[0])]
 
-    def _placed(self, state: WorldState, block: int, pad: int, further: bool = True) -> Subgoal:
+    def _place_subgoal(self, state: WorldState, block: int, pad: int, further: bool = True) -> Subgoal:
         """Return the subgoal that a block rests on a pad, released; it also takes the condition `further`."""
-        there = state.away(block, state.pads[pad]) < self.radius and state.resting(block)
-        return Subgoal(block, state.on_table(block, state.pads[pad]), "place", there and further)
+        rests = state.away(block, state.pads[pad]) < self.radius and state.resting(block)
+        return Subgoal(block, state.on_table(block, state.pads[pad]), "place", rests and further)
 
 
 class PickPlaceTwo(PickPlace):
@@ -64,9 +64,9 @@ class PickPlaceTwo(PickPlace):
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
         """Place and leave the first block, then place the second."""
-        (first, second), (one, other) = referents.blocks, referents.pads
-        left = bool(np.linalg.norm(state.tool - state.positions[first]) > LEFT)
-        return [self._placed(state, first, one, left), self._placed(state, second, other)]
+        (first, second), (first_pad, second_pad) = referents.blocks, referents.pads
+        has_left = bool(np.linalg.norm(state.tool - state.positions[first]) > LEFT)
+        return [self._place_subgoal(state, first, first_pad, has_left), self._place_subgoal(state, second, second_pad)]
 
 
 class Place(PickPlace):
@@ -94,8 +94,8 @@ class Push(Goal):
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
         """Push the block onto the pad's centre."""
         (block,), (pad, _) = referents.blocks, referents.pads
-        there = state.away(block, state.pads[pad]) < self.radius and state.speeds[block] < AT_REST
-        done = bool(there and state.lifts[block] < self.highest)
+        on_pad = state.away(block, state.pads[pad]) < self.radius and state.speeds[block] < AT_REST
+        done = bool(on_pad and state.lifts[block] < self.highest)
         return [Subgoal(block, state.on_table(block, state.pads[pad]), "push", done)]
 
     def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
@@ -115,9 +115,9 @@ class Stack(Goal):
         upper, lower = referents.blocks
         top = state.positions[lower] + UP * state.extents[lower, 2]
         destination = top + UP * state.extents[upper, 2]
-        free = state.speeds[upper] < AT_REST and not state.touched[upper]
+        is_free = state.speeds[upper] < AT_REST and not state.touched[upper]
         level = abs(state.positions[upper, 2] - destination[2]) < SAG
-        done = bool(free and level and state.away(upper, top) < state.extents[lower, 0])
+        done = bool(is_free and level and state.away(upper, top) < state.extents[lower, 0])
         return [Subgoal(upper, destination, "place", done, tolerance=0.007)]
 
     def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
@@ -142,8 +142,8 @@ class Stay(Goal):
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
         """Keep every block in place and the arm at rest."""
         (block,) = referents.blocks
-        moved = np.linalg.norm(state.positions - state.starts, axis=1)
-        done = state.arm_speed < ARM_AT_REST and bool((moved < UNMOVED).all())
+        distances = np.linalg.norm(state.positions - state.starts, axis=1)
+        done = state.arm_speed < ARM_AT_REST and bool((distances < UNMOVED).all())
         return [Subgoal(block, state.positions[block], "stay", done)]
 
 

@@ -129,7 +129,7 @@ class Placement:
         # Equal room for every block, so that this draw is independent of sizes, shapes and distractors.
         radii = [PAD_RADIUS, *[ROOM] * count, *[PAD_RADIUS] * (len(PADS) - 1)]
         for _ in range(200):
-            centres = self._scattered(radii, random_state)
+            centres = self._scatter(radii, random_state)
             if len(centres) == len(radii):
                 break
         else:
@@ -150,14 +150,14 @@ class Placement:
             "yaw": rounded(yaws),
         }
 
-    def _scattered(self, radii: Sequence[float], random_state: np.random.RandomState) -> list[tuple[float, float]]:
+    def _scatter(self, radii: Sequence[float], random_state: np.random.RandomState) -> list[tuple[float, float]]:
         """Sample centres x, y of disjoint discs by rejection; fewer than `radii` if a disc finds no room."""
         centres: list[tuple[float, float]] = []
         for radius in radii:
             for _ in range(100):
                 centre = random_state.uniform(*self.x), random_state.uniform(*self.y)
-                apart = (dist(centre, other) - near for other, near in zip(centres, radii, strict=False))
-                if all(gap > radius + self.clearance for gap in apart):
+                gaps = (dist(centre, other) - other_radius for other, other_radius in zip(centres, radii, strict=False))
+                if all(gap > radius + self.clearance for gap in gaps):
                     centres.append(centre)
                     break
             else:

@@ -38,7 +38,7 @@ class Paraphrase:
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw a replacement for every phrase, whether the instruction has it or not."""
-        scene.paraphrases = {phrase: others[random_state.randint(len(others))] for phrase, others in self.words.items()}
+        scene.paraphrases = {phrase: values[random_state.randint(len(values))] for phrase, values in self.words.items()}
         return {"held_out": 1.0}
 
 
@@ -65,10 +65,10 @@ def paraphrase(instruction: str, words: Mapping[str, str], names: Iterable[str])
         UserError: nothing is replaced, or a name remains.
     """
     phrases = sorted(words, key=len, reverse=True)
-    replaced = re.sub(rf"\b({'|'.join(map(re.escape, phrases))})\b", lambda found: words[found[0]], instruction)
-    if replaced == instruction or set(names) & set(re.findall(r"\w+", replaced)):
+    sentence = re.sub(rf"\b({'|'.join(map(re.escape, phrases))})\b", lambda match: words[match[0]], instruction)
+    if sentence == instruction or set(names) & set(re.findall(r"\w+", sentence)):
         raise UserError(f"task.randomize.phrasing.words must replace everything that is named in {instruction!r}")
-    return replaced
+    return sentence
 
 
 @dataclass(frozen=True)
@@ -87,25 +87,25 @@ class Disturbances:
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Draw kind, number, time, distance and direction; whether it happens also depends on the agent."""
         # Every level draws the same random numbers.
-        kind, times, delay, distance, angle = random_state.uniform(size=5).tolist()
-        chosen = self.kinds[int(kind * len(self.kinds))]
-        number = _whole(self.times, times)
+        kind_share, times, delay, distance, angle = random_state.uniform(size=5).tolist()
+        kind = self.kinds[int(kind_share * len(self.kinds))]
+        number = _integer_at(self.times, times)
         if number == 0:
             return {"kind": "none", "times": 0, "delay": 0, "distance": 0.0, "angle": 0.0}
-        low, high = {"drop": (0.0, 0.0), "push": self.push}.get(chosen, self.move)
-        drawn = {
-            "kind": chosen,
+        low, high = {"drop": (0.0, 0.0), "push": self.push}.get(kind, self.move)
+        values = {
+            "kind": kind,
             "times": number,
-            "delay": _whole(self.start if chosen == "push" else self.delay, delay),
+            "delay": _integer_at(self.start if kind == "push" else self.delay, delay),
             "distance": round(low + distance * (high - low), 5),
             "angle": round(2 * math.pi * angle, 5),
         }
         low_corner, high_corner = zip(self.x, self.y, strict=True)
-        scene.disturbance = Disturbance(**drawn, low=low_corner, high=high_corner)
-        return drawn
+        scene.disturbance = Disturbance(**values, low=low_corner, high=high_corner)
+        return values
 
 
-def _whole(bounds: tuple[int, int], share: float) -> int:
+def _integer_at(bounds: tuple[int, int], share: float) -> int:
     """Return the integer at a share [0, 1) of a range, both ends included."""
     low, high = bounds
     return low + int(share * (high - low + 1))

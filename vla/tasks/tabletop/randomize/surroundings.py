@@ -102,19 +102,19 @@ class Texture:
         """Draw a pattern."""
         kind = PATTERNS[random_state.randint(len(PATTERNS))]
         shade = 1 - random_state.uniform(*self.contrast) * random_state.uniform(0, 1, 3)
-        where = _pattern(kind, random_state)[:, :, None]  # (H, W, 1) 0…1
-        picture = 255 * (1 - where + where * shade)
+        weights = _pattern(kind, random_state)[:, :, None]  # (H, W, 1) 0…1
+        picture = 255 * (1 - weights + weights * shade)
         scene.paint_texture(self.surface, picture.astype(np.uint8))
         return {"kind": kind, "shade": rounded(shade)}
 
 
 def _pattern(kind: str, random_state: np.random.RandomState) -> Array:
     """Draw (TEXTURE, TEXTURE) 0…1, the weight of the second shade."""
-    across, along = np.meshgrid(np.arange(TEXTURE), np.arange(TEXTURE))
+    columns, rows = np.meshgrid(np.arange(TEXTURE), np.arange(TEXTURE))
     if kind == "patches":
-        coarse = random_state.uniform(0, 1, (8, 8))
-        return np.kron(coarse, np.ones((TEXTURE // 8, TEXTURE // 8)))
+        cells = random_state.uniform(0, 1, (8, 8))
+        return np.kron(cells, np.ones((TEXTURE // 8, TEXTURE // 8)))
     width = int(random_state.choice([4, 8, 16]))
     if kind == "stripes":
-        return ((across // width) % 2).astype(float)
-    return ((across // width + along // width) % 2).astype(float)
+        return ((columns // width) % 2).astype(float)
+    return ((columns // width + rows // width) % 2).astype(float)
