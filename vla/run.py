@@ -48,16 +48,16 @@ TRACEBACKS = "VLA_TRACEBACKS"  # environment variable that passes the user's HYD
 
 def sentence(error: Exception) -> str:
     """Describe an error in one printable line, with a suggestion where possible."""
-    return printable(" ".join(_described(error).split()))
+    return printable(" ".join(_describe(error).split()))
 
 
-def _described(error: Exception) -> str:
+def _describe(error: Exception) -> str:
     text = str(error).strip() or type(error).__name__
     if isinstance(error, RecursionError):
         return "a value or a folder is nested too deep: HYDRA_FULL_ERROR=1 shows where"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options is not None:
         group, _, option = error.missing_cfg_file.rpartition("/")
-        return f"{group} has no option '{option}'{_among(option, error.options)}"
+        return f"{group} has no option '{option}'{_choices_hint(option, error.options)}"
     if isinstance(error, OverrideParseException):
         reason = error.message.splitlines()[0]
         return f"cannot read {error.override}: {reason}; quote special characters, as in 'key=\"value\"'"
@@ -81,19 +81,19 @@ def _described(error: Exception) -> str:
     return text
 
 
-def _among(name: str, known: Sequence[str]) -> str:
+def _choices_hint(name: str, names: Sequence[str]) -> str:
     """Return which of the known names was probably meant, or all of them."""
-    return suggestion(name, known) or f": there are {', '.join(known)}"
+    return suggestion(name, names) or f": there are {', '.join(names)}"
 
 
 def _unknown_key(error: OmegaConfBaseException) -> str:
     key = str(error.full_key)
     *path, name = str(error.key).replace("/", ".").split(".")
     parent = OmegaConf.select(error.parent_node, ".".join(path)) if path else error.parent_node
-    known = [str(key) for key in parent if key not in ("hydra", "_target_")] if isinstance(parent, DictConfig) else []
-    among = _among(name, known) if known else ""
+    names = [str(key) for key in parent if key not in ("hydra", "_target_")] if isinstance(parent, DictConfig) else []
+    hint = _choices_hint(name, names) if names else ""
     # The task of a checkpoint may have other keys than that of the command.
-    return f"there is no {key}{among}" + (f"; +{key}=VALUE adds it" if among[:1] == ":" or key[:5] == "task." else "")
+    return f"there is no {key}{hint}" + (f"; +{key}=VALUE adds it" if hint[:1] == ":" or key[:5] == "task." else "")
 
 
 def _is_mendable(error: Exception) -> bool:
@@ -107,16 +107,16 @@ def _is_mendable(error: Exception) -> bool:
 def _require_sweepable(experiment: Experiment, groups: Container[str]) -> None:
     """Refuse a grid without -m or beside another grid, cells that share a folder, and cells on several devices."""
     config = HydraConfig.get()
-    given = {key: value for key, _, value in (override.partition("=") for override in config.overrides.task)}
+    pairs = {key: value for key, _, value in (override.partition("=") for override in config.overrides.task)}
     name, params = config.runtime.choices["experiment"], config.sweeper.params or {}
     if config.mode != RunMode.MULTIRUN:
         if params:
             raise UserError(f"experiment={name} is a grid of runs: add -m")
         return
-    if not given.keys() >= params.keys():
+    if not pairs.keys() >= params.keys():
         raise UserError(f"experiment={name} is a grid of its own: run it without other experiments")
-    if "${" not in given.get("output", "${"):
-        raise UserError(f"output={given['output']} would be every cell's folder: name the sweep's, hydra.sweep.dir=DIR")
+    if "${" not in pairs.get("output", "${"):
+        raise UserError(f"output={pairs['output']} would be every cell's folder: name the sweep's, hydra.sweep.dir=DIR")
     slurm = config.runtime.choices["hydra/launcher"] == "submitit_slurm"
     if "trainer" in groups and not slurm and devices(experiment["trainer"]) > 1:
         # Processes that a trainer starts repeat the command line, here the whole sweep.
@@ -130,19 +130,19 @@ def _require_sweepable(experiment: Experiment, groups: Container[str]) -> None:
 def _without_empty_folders(cfg: DictConfig) -> Iterator[None]:
     """Remove the folder that Hydra created for this run, and a new `output`, if they end with no files but Hydra's."""
     folder, output = Path(HydraConfig.get().runtime.output_dir), Path(str(cfg.output))
-    created = [output] if not output.exists() else []
+    new_folders = [output] if not output.exists() else []
     if HydraConfig.get().mode == RunMode.RUN and folder.resolve() != Path.cwd():
-        created.append(folder)
+        new_folders.append(folder)
     try:
         yield
     finally:
-        for each in created:
-            files = (path.relative_to(each) for path in each.rglob("*") if not path.is_dir())
+        for new_folder in new_folders:
+            files = (path.relative_to(new_folder) for path in new_folder.rglob("*") if not path.is_dir())
             if {path.parts[0] for path in files} <= {".hydra"}:
-                shutil.rmtree(each, ignore_errors=True)
+                shutil.rmtree(new_folder, ignore_errors=True)
 
 
-def _do(cfg: DictConfig) -> float | None:
+def _run_job(cfg: DictConfig) -> float | None:
     without_triton()
     overrides = list(HydraConfig.get().overrides.task)
     cfg = with_variant(cfg, overrides)
@@ -150,17 +150,17 @@ def _do(cfg: DictConfig) -> float | None:
     # Before anything is read from a file.
     trust(composed.get("trust"), [composed["job"], *targets(composed)], packages(composed))
     default = compose("config", [f"job={HydraConfig.get().runtime.choices['job']}"])
-    cfg = _adopted(cfg, overrides)
+    cfg = _merge_saved(cfg, overrides)
     experiment, job = Experiment.of(cfg, default), jobs.find(cfg.job)
     check(experiment, job)
     _require_sweepable(experiment, job.needs(experiment.nodes))
-    if jobs.builds_world(experiment) and (others := substitutes(experiment["task"], overrides)):
-        overrides += others
-        experiment = Experiment.of(_adopted(compose_again(*overrides), overrides), default)
+    if jobs.builds_world(experiment) and (replacements := substitutes(experiment["task"], overrides)):
+        overrides += replacements
+        experiment = Experiment.of(_merge_saved(compose_again(*overrides), overrides), default)
     return jobs.run(experiment)
 
 
-def _adopted(cfg: DictConfig, overrides: list[str]) -> DictConfig:
+def _merge_saved(cfg: DictConfig, overrides: list[str]) -> DictConfig:
     """Return `cfg` merged with the run, policy or pretrained weights that it names; raise a UserError if impossible."""
     for key in ("resume", "checkpoint", "pretrained", "output"):
         if not isinstance(cfg[key], str | None) or (key == "output" and not cfg[key]):
@@ -220,17 +220,17 @@ def _say_how_to_continue(cfg: DictConfig) -> None:
     """
     if HydraConfig.get().mode == RunMode.RUN and cfg.job in CONTINUED:
         overrides = HydraConfig.get().overrides
-        given = {override.partition("=")[0] for override in (*overrides.task, *overrides.hydra)}
-        has_folder = cfg.job == "collect" or given & {"output", "resume", "hydra.run.dir"}
-        added = "" if has_folder else f" with output={os.path.relpath(cfg.output)}"
-        log.info("interrupted: the same command%s continues", added)
+        keys = {override.partition("=")[0] for override in (*overrides.task, *overrides.hydra)}
+        has_folder = cfg.job == "collect" or keys & {"output", "resume", "hydra.run.dir"}
+        addition = "" if has_folder else f" with output={os.path.relpath(cfg.output)}"
+        log.info("interrupted: the same command%s continues", addition)
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def _compose(cfg: DictConfig) -> float | None:
     try:
         with _without_empty_folders(cfg):
-            return _do(cfg)
+            return _run_job(cfg)
     except KeyboardInterrupt:
         _say_how_to_continue(cfg)
         raise
@@ -243,14 +243,14 @@ def _compose(cfg: DictConfig) -> float | None:
 def _require_plain(arguments: list[str]) -> None:
     """Refuse arguments that Hydra would answer with its usage message or a traceback, and its option that loads a
     config from a pickle, which may execute any code; options can be abbreviated."""
-    if {"-m", "--multirun"} & {*arguments} and any(each.partition("=")[0] in ("-c", "--cfg") for each in arguments):
+    if {"-m", "--multirun"} & {*arguments} and any(word.partition("=")[0] in ("-c", "--cfg") for word in arguments):
         raise UserError("--cfg shows the config of one run: leave out -m, and give every key one value")
-    if "--resolve" in arguments and not any(each.startswith(("-c", "--cfg", "-h", "--help")) for each in arguments):
+    if "--resolve" in arguments and not any(word.startswith(("-c", "--cfg", "-h", "--help")) for word in arguments):
         raise UserError("--resolve goes with --cfg job, which shows the config")
-    for name, _, value in (each.partition("=") for each in arguments if "=" in each):
+    for name, _, value in (word.partition("=") for word in arguments if "=" in word):
         if name.startswith("--") and not any(option.startswith(name) for option in OPTIONS):
             raise UserError(f"{name} is no option: write {name.strip('-')}={value}, without dashes")
-    if any(len(name := each.partition("=")[0]) > 2 and PICKLE.startswith(name) for each in arguments):
+    if any(len(name := word.partition("=")[0]) > 2 and PICKLE.startswith(name) for word in arguments):
         raise UserError(f"{PICKLE} runs whatever a file says: compose the run again from its command line")
 
 
@@ -266,7 +266,7 @@ def _require_options(arguments: list[str]) -> None:
         if group in ("job", "experiment") and value.startswith("["):
             raise UserError(f"{argument} names several: {group} takes one option")
         folders = [path for folder in config_folders() if (path := folder / group).is_dir()]
-        is_value = any(re.fullmatch(r"(?i:null|true|false)|[+-]?\d+(\.\d+)?", each) for each in value.split(","))
+        is_value = any(re.fullmatch(r"(?i:null|true|false)|[+-]?\d+(\.\d+)?", part) for part in value.split(","))
         if is_value and (folders or "/" in group):
             hint = f", as in {group}=none" if any((path / "none.yaml").is_file() for path in folders) else ""
             dotted = f"; a value has dots, {group.replace('/', '.')}={value}" if "/" in group else ""

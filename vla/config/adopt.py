@@ -47,19 +47,19 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     A path or address in these three nodes is an error; in the saved expert it becomes null. Raises a UserError if there
     is no such policy, or an override contradicts its weights.
     """
-    parsed = _parsed(overrides, ("tokenizer", "model", "experiment"))
-    saved = read_policy(cfg.checkpoint).config
-    require_no_paths(saved, REQUIRED_NODES, cfg.checkpoint, _given(parsed))
-    values = _values(saved, REQUIRED_NODES)
+    parsed = _parse(overrides, ("tokenizer", "model", "experiment"))
+    saved_config = read_policy(cfg.checkpoint).config
+    require_no_paths(saved_config, REQUIRED_NODES, cfg.checkpoint, _replaced_paths(parsed))
+    values = _values(saved_config, REQUIRED_NODES)
     if cfg.job == "evaluate":
-        if over := [each for each in parsed if _path(each).partition(".")[0] in OVER]:
+        if ignored := [override for override in parsed if _path(override).partition(".")[0] in OVER]:
             text = "ignored: %s, because checkpoint= evaluates a policy as it is; pretrained= trains it further"
-            log.warning(text, ", ".join(str(each.input_line) for each in over))
-        parsed = [each for each in parsed if each not in over]  # a report shows the training as it was
-        values |= _values(saved, REPORTED)
+            log.warning(text, ", ".join(str(override.input_line) for override in ignored))
+        parsed = [override for override in parsed if override not in ignored]  # a report shows the training as it was
+        values |= _values(saved_config, REPORTED)
         # The only one of them that is ever built, in an open-loop evaluation.
-        values |= {"expert": without_paths(saved, "expert")} if "expert" in saved else {}
-    return _on_top(cfg, values | _chosen(saved, "experiment", "model"), parsed)
+        values |= {"expert": without_paths(saved_config, "expert")} if "expert" in saved_config else {}
+    return _merge(cfg, values | _chosen_options(saved_config, "experiment", "model"), parsed)
 
 
 def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
@@ -76,14 +76,14 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
         )
     if is_trunk(cfg.pretrained):
         return _with_trunk(cfg)
-    saved, improved = read_policy(cfg.pretrained).config, cfg.job == "improve"  # first, to report a wrong path
-    parsed = _parsed(overrides, ("tokenizer", "model", "experiment"))
-    parts = (*REQUIRED_NODES, *OF_TRAINING) if improved else ("tokenizer", "model", "data")
-    require_no_paths(saved, parts, cfg.pretrained, _given(parsed) if improved else None)
-    values = _values(saved, parts)
+    saved_config, in_rounds = read_policy(cfg.pretrained).config, cfg.job == "improve"  # first, to report a wrong path
+    parsed = _parse(overrides, ("tokenizer", "model", "experiment"))
+    parts = (*REQUIRED_NODES, *OF_TRAINING) if in_rounds else ("tokenizer", "model", "data")
+    require_no_paths(saved_config, parts, cfg.pretrained, _replaced_paths(parsed) if in_rounds else None)
+    values = _values(saved_config, parts)
     if "seed" in values.get("data", {}):
         values["data"] = {**values["data"], "seed": "${seed}"}  # of the new training: it orders the windows
-    return _on_top(cfg, values | _chosen(saved, "model"), parsed)
+    return _merge(cfg, values | _chosen_options(saved_config, "model"), parsed)
 
 
 def _with_trunk(cfg: DictConfig) -> DictConfig:
@@ -96,9 +96,9 @@ def _with_trunk(cfg: DictConfig) -> DictConfig:
         raise UserError(
             f"pretrained={cfg.pretrained} has weights of another project: choose their model, as in model=smolvla"
         )
-    adopted = copy.deepcopy(cfg)
-    adopted.model.trunk, adopted.pretrained = cfg.pretrained, None
-    return adopted
+    config = copy.deepcopy(cfg)
+    config.model.trunk, config.pretrained = cfg.pretrained, None
+    return config
 
 
 def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
@@ -110,31 +110,31 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
     """
     if cfg.checkpoint is not None or cfg.pretrained is not None:
         raise UserError(f"resume={cfg.resume} continues a run unchanged: omit checkpoint= and pretrained=")
-    file, saved = _saved(run)
+    file, saved_config = _read_config(run)
     output = Path(cfg.output).resolve()
     if run.resolve().parent != output.parent and run.resolve() != output:
         raise UserError(
             f"resume={run} is not among your runs in {output.parent}, and a stranger's config could name any file: "
             f"add output={run} if the run is yours, or train from its weights with pretrained={run}"
         )
-    if cfg.job == "improve" != saved.get("job"):
+    if cfg.job == "improve" != saved_config.get("job"):
         raise UserError(f"resume={run} is a training without rounds: job=improve pretrained={run} improves it")
-    own = str(saved.get("job")).rpartition(".")[2]  # a job has a node of its own
-    parsed, known = _parsed(overrides, ("experiment",)), {*map(str, cfg), own} - {"output", "resume", "trust"}
-    taken = {name: node for name, node in saved.items() if name in known}
-    require_trust(taken, taken, file)
-    if "trainer" in _given(parsed):
-        kept = {name: value for name, value in saved.get("trainer", {}).items() if name not in MACHINES}
-        taken["trainer"] = kept | {name: cfg.trainer[name] for name in MACHINES if name in cfg.trainer}
+    job = str(saved_config.get("job")).rpartition(".")[2]  # a job has a node of its own
+    parsed, names = _parse(overrides, ("experiment",)), {*map(str, cfg), job} - {"output", "resume", "trust"}
+    nodes = {name: node for name, node in saved_config.items() if name in names}
+    require_trust(nodes, nodes, file)
+    if "trainer" in _replaced_paths(parsed):
+        trainer = {name: value for name, value in saved_config.get("trainer", {}).items() if name not in MACHINES}
+        nodes["trainer"] = trainer | {name: cfg.trainer[name] for name in MACHINES if name in cfg.trainer}
         parsed = [override for override in parsed if _path(override) != "trainer" or not _replaces(override)]
-    resumed = _on_top(cfg, taken, parsed)
+    config = _merge(cfg, nodes, parsed)
     # Paths of rounds begin with the folder as it was written in the first command.
-    same = isinstance(saved.get("output"), str) and Path(saved["output"]).resolve() == run.resolve()
-    resumed.output, resumed.resume = saved["output"] if same else str(run), str(run)
-    return resumed
+    in_place = isinstance(saved_config.get("output"), str) and Path(saved_config["output"]).resolve() == run.resolve()
+    config.output, config.resume = saved_config["output"] if in_place else str(run), str(run)
+    return config
 
 
-def _saved(run: Path) -> tuple[Path, Mapping[str, Any]]:
+def _read_config(run: Path) -> tuple[Path, Mapping[str, Any]]:
     """Return the file with the config of a run, its last checkpoint or config.yaml for rounds, and that config."""
     if (run / LAST).is_file():
         return run / LAST, read_header(run / LAST).config
@@ -144,13 +144,13 @@ def _saved(run: Path) -> tuple[Path, Mapping[str, Any]]:
     raise UserError(f"resume={run} has no training to continue: there is no {run / LAST}")
 
 
-def _values(saved: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+def _values(config: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
     """Return dotted key → saved value, without keys that the saved config lacks."""
-    return {key: value for key in keys if (value := at(saved, key)) != ABSENT}
+    return {key: value for key in keys if (value := at(config, key)) != ABSENT}
 
 
-def _chosen(saved: Mapping[str, Any], *groups: str) -> dict[str, Any]:
-    return {f"chosen.{group}": at(saved, f"chosen.{group}", None) for group in groups}
+def _chosen_options(config: Mapping[str, Any], *groups: str) -> dict[str, Any]:
+    return {f"chosen.{group}": at(config, f"chosen.{group}", None) for group in groups}
 
 
 def require_identity(
@@ -160,19 +160,19 @@ def require_identity(
 
     The dotted keys of `IDENTITY`, and `further` ones, must have equal values.
     """
-    standard = {"trainer.num_nodes": 1}  # the default of trainers that omit it
-    before, now = ({key: at(each, key, standard.get(key)) for key in (*IDENTITY, *further)} for each in (saved, config))
-    changed = [key for key, _, _ in differences(before, now)]
-    if changed:
+    defaults = {"trainer.num_nodes": 1}  # the default of trainers that omit it
+    old, new = ({key: at(node, key, defaults.get(key)) for key in (*IDENTITY, *further)} for node in (saved, config))
+    keys = [key for key, _, _ in differences(old, new)]
+    if keys:
         weights = f"; pretrained={folder} starts another from its weights" if (folder / POLICY).exists() else ""
         way_out = f"choose another output=DIR (hydra.sweep.dir=DIR of a sweep), or continue it with resume={folder}"
         raise UserError(
-            f"{folder} holds a training that differs in {', '.join(changed[:3])}{', …' if changed[3:] else ''}: "
+            f"{folder} holds a training that differs in {', '.join(keys[:3])}{', …' if keys[3:] else ''}: "
             f"{'omit that to continue it' if config.get('resume') else way_out}{weights}"
         )
 
 
-def _parsed(overrides: Sequence[str], fixed: Sequence[str]) -> list[Override]:
+def _parse(overrides: Sequence[str], fixed: Sequence[str]) -> list[Override]:
     """Parse overrides; raise a UserError if one changes a group that is `fixed` by the weights."""
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     for override in parsed:
@@ -185,7 +185,7 @@ def _parsed(overrides: Sequence[str], fixed: Sequence[str]) -> list[Override]:
     return parsed
 
 
-def _given(parsed: Iterable[Override]) -> list[str]:
+def _replaced_paths(parsed: Iterable[Override]) -> list[str]:
     return [_path(override) for override in parsed if _replaces(override)]
 
 
@@ -200,25 +200,25 @@ def _path(override: Override) -> str:
     return package if package and not package.startswith("_") else override.key_or_group.replace("/", ".")
 
 
-def _on_top(cfg: DictConfig, saved: Mapping[str, Any], parsed: Sequence[Override]) -> DictConfig:
+def _merge(cfg: DictConfig, values: Mapping[str, Any], parsed: Sequence[Override]) -> DictConfig:
     """Return `cfg` with saved values at dotted keys, and the command line's overrides on top of these."""
-    adopted = copy.deepcopy(cfg)
-    changed = {key.partition(".")[0] for key in saved}
-    with open_dict(adopted):
-        for key, value in saved.items():
-            OmegaConf.update(adopted, key, value, merge=False, force_add=True)
+    config = copy.deepcopy(cfg)
+    groups = {key.partition(".")[0] for key in values}
+    with open_dict(config):
+        for key, value in values.items():
+            OmegaConf.update(config, key, value, merge=False, force_add=True)
         for override in parsed:
             path = _path(override)
-            if path.partition(".")[0] not in changed:
+            if path.partition(".")[0] not in groups:
                 continue
             if override.is_delete():
                 parent, _, name = path.rpartition(".")
-                node = OmegaConf.select(adopted, parent)
+                node = OmegaConf.select(config, parent)
                 if not isinstance(node, DictConfig):
                     raise UserError(f"{override.input_line} removes nothing, the saved config has no {parent}: omit it")
                 node.pop(name, None)
             elif _replaces(override):
-                OmegaConf.update(adopted, path, OmegaConf.select(cfg, path), merge=False, force_add=True)
+                OmegaConf.update(config, path, OmegaConf.select(cfg, path), merge=False, force_add=True)
             else:
-                OmegaConf.update(adopted, path, override.value(), merge=True, force_add=True)
-    return adopted
+                OmegaConf.update(config, path, override.value(), merge=True, force_add=True)
+    return config

@@ -60,17 +60,17 @@ def locate(key: str, target: Any) -> type:
     module, _, name = target.rpartition(".")
     package = target.partition(".")[0]
     try:
-        found = getattr(import_module(module), name)
+        attribute = getattr(import_module(module), name)
     except (ImportError, AttributeError) as error:
-        where = "" if target.startswith(OWN) else f" on {gethostname()}, where {package} must be installed"
+        place = "" if target.startswith(OWN) else f" on {gethostname()}, where {package} must be installed"
         library = isinstance(error, ModuleNotFoundError) and not f"{error.name}.".startswith(f"{package}.")
         kind, hint = (MissingLibrary, how_to_install(str(error.name))) if library else (UserError, "")
-        raise kind(f"{key} is {target}, which cannot be imported{where}: {error}{hint}") from error
+        raise kind(f"{key} is {target}, which cannot be imported{place}: {error}{hint}") from error
     # A module's attributes include its imports, such as `os`.
-    defined = isinstance(found, type) and found.__module__.partition(".")[0] in (OWN.rstrip("."), package)
-    if not isinstance(found, type) or not (target in LIBRARY or defined):
+    defined = isinstance(attribute, type) and attribute.__module__.partition(".")[0] in (OWN.rstrip("."), package)
+    if not isinstance(attribute, type) or not (target in LIBRARY or defined):
         raise UserError(f"{key} must name a class that is defined in {package}, got {target!r}")
-    return found
+    return attribute
 
 
 def how_to_install(module: str) -> str:
@@ -81,7 +81,7 @@ def how_to_install(module: str) -> str:
         return ""
     pattern = rf"{re.escape(module.partition('.')[0])}\b.*extra == '(\w+)'"
     # The last match counts, in alphabetical order: of the extras with transformers that is vlm, which suffices for all.
-    *_, extra = ["", *(found[1] for each in requirements if (found := re.match(pattern, each)))]
+    *_, extra = ["", *(match[1] for requirement in requirements if (match := re.match(pattern, requirement)))]
     return f"; install vla with its extra {extra}: pip install -e '.[{extra}]'" if extra else ""
 
 
@@ -115,7 +115,7 @@ def packages(value: Any) -> list[Any]:
 def fits(found: type, expected: Any) -> bool:
     """Return whether the class `found` satisfies `expected`, a class, a union or a protocol."""
     if get_origin(expected) in (Union, types.UnionType):
-        return any(fits(found, each) for each in get_args(expected))
+        return any(fits(found, alternative) for alternative in get_args(expected))
     expected = get_origin(expected) or expected
     if not isinstance(expected, type):
         return False
@@ -139,18 +139,18 @@ def mismatch(key: str, value: Any, annotation: Any) -> str:
     else:
         return ""
     # Members of a union fail at different depths: the deepest error is the most specific.
-    path, part = max((_within(value, each["loc"]) for each in errors), key=lambda within: len(within[0]))
-    reasons = dict.fromkeys(each["msg"] for each in errors if _within(value, each["loc"])[0] == path)
-    words = [re.sub(r"^\w+ should (be )?| after validation.*", "", each).replace("None", "null") for each in reasons]
+    path, part = max((_part_at(value, detail["loc"]) for detail in errors), key=lambda place: len(place[0]))
+    reasons = dict.fromkeys(detail["msg"] for detail in errors if _part_at(value, detail["loc"])[0] == path)
+    words = [re.sub(r"^\w+ should (be )?| after validation.*", "", text).replace("None", "null") for text in reasons]
     verb = "must" if words[0].startswith(("have ", "match ")) else "must be"
     sentence = f"{key}{path} {verb} {' or '.join(words)}, got {short(part)}"
-    if isinstance(part, str) and any(each["type"] == "node" for each in errors):
+    if isinstance(part, str) and any(detail["type"] == "node" for detail in errors):
         return f"{sentence}: an option is chosen with a slash, {f'{key}{path}'.replace('.', '/')}={part}"
     choices = [str(choice) for choice in get_args(annotation)] if get_origin(annotation) is Literal else []
     return f"{sentence}{suggestion(str(part), choices)}"
 
 
-def _within(value: Any, location: Sequence[int | str]) -> tuple[str, Any]:
+def _part_at(value: Any, location: Sequence[int | str]) -> tuple[str, Any]:
     """Return dotted path and part of a value at pydantic's `location`, which also names members of unions."""
     path = ""
     for key in location:
@@ -169,37 +169,37 @@ def short(value: Any) -> str:
 
 @cache
 def _adapter(annotation: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(_of_json(annotation), config=ConfigDict(allow_inf_nan=False))
+    return TypeAdapter(_convert(annotation), config=ConfigDict(allow_inf_nan=False))
 
 
-def _of_json(annotation: Any) -> Any:
+def _convert(annotation: Any) -> Any:
     """Convert `annotation` for pydantic's validation of JSON: classes become nodes, sequences become lists."""
     kind, arguments = get_origin(annotation), get_args(annotation)
     if annotation in SCALARS or annotation is None or kind is Literal:
         return annotation
     if kind is Annotated:
-        constraints = (_required(each) if isinstance(each, Predicate) else each for each in arguments[1:])
-        return Annotated[(_of_json(arguments[0]), *constraints)]  # type: ignore[invalid-annotation]
+        constraints = (_validator(item) if isinstance(item, Predicate) else item for item in arguments[1:])
+        return Annotated[(_convert(arguments[0]), *constraints)]  # type: ignore[invalid-annotation]
     if kind in (Union, types.UnionType):
-        return Union[tuple(map(_of_json, arguments))]  # type: ignore[invalid-annotation]  # noqa: UP007
+        return Union[tuple(map(_convert, arguments))]  # type: ignore[invalid-annotation]  # noqa: UP007
     if (kind or annotation) in PATHS:
         return Annotated[str, MinLen(1)]
     if kind is tuple:
-        return tuple[tuple(each if each is Ellipsis else _of_json(each) for each in arguments)]  # type: ignore[misc]
+        return tuple[tuple(item if item is Ellipsis else _convert(item) for item in arguments)]  # type: ignore[misc]
     if (kind or annotation) in SEQUENCES:
-        return list[_of_json(arguments[0]) if arguments else Any]  # type: ignore[misc]
+        return list[_convert(arguments[0]) if arguments else Any]  # type: ignore[misc]
     if (kind or annotation) in MAPPINGS:
-        return dict[str, _of_json(arguments[1]) if arguments else Any]  # type: ignore[misc]
+        return dict[str, _convert(arguments[1]) if arguments else Any]  # type: ignore[misc]
     if annotation is object:  # the caller validates it
         return Any
     if annotation in (Any, inspect.Parameter.empty) or isinstance(annotation, TypeVar):
-        return Annotated[Any, BeforeValidator(_plain)]
+        return Annotated[Any, BeforeValidator(_require_plain)]
     if getattr(kind, "__name__", "") == "Callable":
-        return Annotated[Any, BeforeValidator(lambda value: _node(value, arguments[1], partial=True))]
-    return Annotated[Any, BeforeValidator(lambda value: _node(value, annotation, partial=False))]
+        return Annotated[Any, BeforeValidator(lambda value: _require_node(value, arguments[1], partial=True))]
+    return Annotated[Any, BeforeValidator(lambda value: _require_node(value, annotation, partial=False))]
 
 
-def _required(predicate: Predicate) -> AfterValidator:
+def _validator(predicate: Predicate) -> AfterValidator:
     """Convert a predicate, whose docstring completes "must be …"."""
 
     def checked(value: Any) -> Any:
@@ -210,19 +210,19 @@ def _required(predicate: Predicate) -> AfterValidator:
     return AfterValidator(checked)
 
 
-def _plain(value: Any) -> Any:
+def _require_plain(value: Any) -> Any:
     if is_node(value):
         raise PydanticCustomError("plain", "a plain value without a _target_")
     if isinstance(value, float) and not isfinite(value):
         raise PydanticCustomError("plain", "finite")
     for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
-        _plain(part)
+        _require_plain(part)
     return value
 
 
-def _node(value: Any, expected: Any, partial: bool) -> Any:
-    right = is_node(value) and bool(value.get("_partial_")) is partial
-    if not right or not fits(locate("_target_", value["_target_"]), expected):
+def _require_node(value: Any, expected: Any, partial: bool) -> Any:
+    matches = is_node(value) and bool(value.get("_partial_")) is partial
+    if not matches or not fits(locate("_target_", value["_target_"]), expected):
         name: Any = f"{'a factory of ' if partial else ''}{getattr(expected, '__name__', expected)}"
         raise PydanticCustomError("node", name)
     return value

@@ -157,7 +157,7 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
         raise UserError(f"{key}._partial_ must be {'true or false' if expected is object else 'omitted here'}")
     target = locate(f"{key}._target_", node["_target_"])
     if not fits(target, expected):
-        kind = " or ".join(each.__name__ for each in getattr(expected, "__args__", (expected,)))
+        kind = " or ".join(alternative.__name__ for alternative in getattr(expected, "__args__", (expected,)))
         raise UserError(f"{key}._target_ must name a class of kind {kind}, got {node['_target_']}")
     values = {name: value for name, value in node.items() if name not in HYDRA_KEYS}
     check_arguments(key, values, target, runtime, partial, NARROWER.get(node["_target_"], {}))
@@ -175,19 +175,19 @@ def check_arguments(
 ) -> None:
     """Check the arguments of the class `target` in a node at `key`, see `check_node`."""
     parameters = arguments(target)
-    several = [name for name, each in parameters.items() if each.kind is inspect.Parameter.VAR_KEYWORD]
-    known = [name for name in parameters if name not in (*runtime, *several)]
-    if lacking := [name for name in runtime if not several and name not in parameters]:
-        raise UserError(f"{key}: {target.__name__} must take the arguments {', '.join(lacking)}, which the job gives")
-    hints = {name: each.annotation for name, each in parameters.items()} | dict(narrower or {})
+    variadic = [name for name, parameter in parameters.items() if parameter.kind is inspect.Parameter.VAR_KEYWORD]
+    names = [name for name in parameters if name not in (*runtime, *variadic)]
+    if missing := [name for name in runtime if not variadic and name not in parameters]:
+        raise UserError(f"{key}: {target.__name__} must take the arguments {', '.join(missing)}, which the job gives")
+    hints = {name: parameter.annotation for name, parameter in parameters.items()} | dict(narrower or {})
     prefix = f"{key}." if key else ""
     for name, value in values.items():
-        if not several or str(name).startswith("_"):
-            require_known(key, name, known, target.__name__)
+        if not variadic or str(name).startswith("_"):
+            require_known(key, name, names, target.__name__)
         if value == MISSING:
             raise UserError(f"{prefix}{name} is missing: the options chosen need {prefix}{name}=VALUE")
         check_value(f"{prefix}{name}", value, hints.get(name, Any))
-    for name in known:
+    for name in names:
         by_caller = partial and (name in RUNTIME or parameters[name].kind is inspect.Parameter.KEYWORD_ONLY)
         if name not in values and not by_caller and parameters[name].default is inspect.Parameter.empty:
             raise UserError(f"{prefix}{name} is missing: {target.__name__} needs it")
@@ -243,11 +243,11 @@ def _paths_in(node: Any, key: str) -> Iterator[tuple[dict[str, Any], str, str]]:
     """
     if is_node(node):
         try:
-            known = arguments(locate(f"{key}._target_", node["_target_"]))
+            parameters = arguments(locate(f"{key}._target_", node["_target_"]))
         except MissingLibrary:
             return
         for name, value in node.items():
-            if value and name in known and (name in ADDRESSES or takes_path(known[name].annotation)):
+            if value and name in parameters and (name in ADDRESSES or takes_path(parameters[name].annotation)):
                 yield node, key, name
     for name, part in _parts(node):
         yield from _paths_in(part, f"{key}.{name}")
@@ -261,8 +261,8 @@ def _parts(value: Any) -> Iterable[tuple[Any, Any]]:
 def check_value(key: str, value: Any, annotation: Any) -> None:
     """Raise a UserError with the dotted name `key` if a value does not match an annotation."""
     _check_nodes(key, value)  # first, because an error within a node is more specific
-    if wrong := mismatch(key, value, annotation):
-        raise UserError(wrong)
+    if problem := mismatch(key, value, annotation):
+        raise UserError(problem)
 
 
 def _check_nodes(key: str, value: Any) -> None:
@@ -286,13 +286,13 @@ def arguments(target: type) -> dict[str, inspect.Parameter]:
 
     `**inherited: Inherited` is replaced by the arguments of the next base class with a constructor.
     """
-    found: dict[str, inspect.Parameter] = {}
+    parameters: dict[str, inspect.Parameter] = {}
     for base in (base for base in target.__mro__[:-1] if "__init__" in vars(base)):
-        own = _parameters(base)
-        found = {**own, **found}
-        if all(each.annotation is not Inherited for each in own.values()):
+        own_parameters = _parameters(base)
+        parameters = {**own_parameters, **parameters}
+        if all(parameter.annotation is not Inherited for parameter in own_parameters.values()):
             break
-    return {name: each for name, each in found.items() if each.annotation is not Inherited}
+    return {name: parameter for name, parameter in parameters.items() if parameter.annotation is not Inherited}
 
 
 @cache
@@ -302,13 +302,13 @@ def _parameters(target: type) -> Mapping[str, inspect.Parameter]:
     # The constructor of a dataclass also has annotations from the modules of its base classes.
     bases = (vars(sys.modules[base.__module__]) for base in target.__mro__[:-1])
     scope = ChainMap(inspect.unwrap(init).__globals__, *bases)
-    found = {}
-    for name, each in list(inspect.signature(init).parameters.items())[1:]:
-        annotation = each.annotation
+    parameters = {}
+    for name, parameter in list(inspect.signature(init).parameters.items())[1:]:
+        annotation = parameter.annotation
         if isinstance(annotation, str):
             try:
                 annotation = eval(annotation, {}, scope)
             except NameError:  # imported for type checking only
                 annotation = Any
-        found[name] = each.replace(annotation=annotation)
-    return found
+        parameters[name] = parameter.replace(annotation=annotation)
+    return parameters

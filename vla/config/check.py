@@ -53,18 +53,18 @@ def check(experiment: Experiment, job: Job) -> None:
     try:
         _check(experiment, job)
     except UserError as error:
-        if origin := _of_experiment(experiment.nodes, str(error)):
-            raise UserError(f"{error}; {origin}") from error
+        if hint := _experiment_hint(experiment.nodes, str(error)):
+            raise UserError(f"{error}; {hint}") from error
         raise
 
 
 def _check(experiment: Experiment, job: Job) -> None:
     config = experiment.nodes
-    values = {each.name: config[each.name] for each in fields(Settings) if each.name in config}
+    values = {field.name: config[field.name] for field in fields(Settings) if field.name in config}
     groups = {name: GROUPS[name] for name in OF_EVERY_JOB} | job.needs(config)
     files = (file for folder in config_folders() for file in (folder / "job").glob("*.yaml"))
-    of_jobs = {file.stem for file in files}  # an experiment may have options of another job
-    for name in (name for name in config if name not in of_jobs):
+    job_names = {file.stem for file in files}  # an experiment may have options of another job
+    for name in (name for name in config if name not in job_names):
         require_known("", name, {**values, **GROUPS, **groups}, "the config")
     check_arguments("", values, Settings)
     settings = experiment.settings
@@ -76,8 +76,8 @@ def _check(experiment: Experiment, job: Job) -> None:
     for name, group in groups.items():
         if config.get(name) is not None:
             _check_group(config[name], group, may_lack=name in job.stored)
-            if absent := [key for key in NEEDED.get(name, ()) if key not in config[name]]:
-                raise UserError(f"{name}.{absent[0]} is missing: trainings need it")
+            if missing_keys := [key for key in NEEDED.get(name, ()) if key not in config[name]]:
+                raise UserError(f"{name}.{missing_keys[0]} is missing: trainings need it")
         elif not group.optional:
             raise UserError(f"job={settings.job} needs {name}=OPTION; --help lists the options")
     if "model" in groups:
@@ -88,13 +88,13 @@ def _check(experiment: Experiment, job: Job) -> None:
 
             method = locate("policy.chunking._target_", chunking["_target_"])
             require_chunking(method, kinds[1], config["model"].get("prefix", 0))
-        model, begun = config["model"], settings.pretrained or settings.checkpoint
-        if model.get("statistics") == "pretrained" and model.get("trunk", "") is None and not begun:
+        model, initial_policy = config["model"], settings.pretrained or settings.checkpoint
+        if model.get("statistics") == "pretrained" and model.get("trunk", "") is None and not initial_policy:
             raise UserError("model.statistics=pretrained needs a published policy: add pretrained=… or omit the option")
     _check_contents(experiment, groups)
 
 
-def _of_experiment(config: Mapping[str, Any], error: str) -> str:
+def _experiment_hint(config: Mapping[str, Any], error: str) -> str:
     """Return how to override the chosen experiment at the key that an error begins with; "" if it does not set that."""
     name, key = at(config, "chosen.experiment"), error.partition(" ")[0]
     if "." not in key or config.get("checkpoint") is not None:  # which has an experiment of its own
@@ -113,17 +113,17 @@ def _experiments(name: str) -> Iterator[dict[str, Any]]:
         with suppress(UserError):  # YAML that only Hydra reads, such as aliases: the error then has no hint
             content = read_yaml(file, dict[str, Any])
             yield content
-            for other in content.get("defaults") or ():
-                if isinstance(other, str) and other != "_self_":
-                    yield from _experiments(other)
+            for option in content.get("defaults") or ():
+                if isinstance(option, str) and option != "_self_":
+                    yield from _experiments(option)
 
 
 def _check_group(node: Any, group: Group, may_lack: bool) -> None:
     """Check the node of a group, whose library this machine `may_lack`."""
     nodes = {f"{group.name}.{key}": part for key, part in node.items()} if group.several else {group.name: node}
-    for key, each in nodes.items():
+    for key, child in nodes.items():
         with suppress(MissingLibrary) if may_lack else nullcontext():
-            check_node(key, each, makes(group), group.runtime)
+            check_node(key, child, makes(group), group.runtime)
 
 
 def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None:
@@ -131,25 +131,25 @@ def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None
     settings, validate, evaluate = experiment.settings, experiment.validate, experiment.evaluate
     if settings.checkpoint is None:  # with a checkpoint, the seeds of its own training count
         _require_apart(validate, evaluate)
-    changed = {}
+    conditions = {}
     if settings.job in ("evaluate", "improve"):
-        changed = {f"evaluate.conditions.{name}": changes for name, changes in evaluate.changes.items()}
+        conditions = {f"evaluate.conditions.{name}": changes for name, changes in evaluate.changes.items()}
     if "learner" in groups and validate.episodes:
-        changed["validate.changes"] = validate.changes
+        conditions["validate.changes"] = validate.changes
     if "improve" in groups:
-        changed["improve.changes"] = experiment.options(Rounds).changes
-    for name, changes in changed.items():
+        conditions["improve.changes"] = experiment.options(Rounds).changes
+    for name, changes in conditions.items():
         if changes:
             check_node(f"task ({name})", with_changes(experiment["task"], changes), makes(GROUPS["task"]))
 
 
 def devices(trainer: Mapping[str, Any]) -> int:
     """Return how many devices a trainer node asks for, on all of its machines."""
-    asked, nodes = trainer.get("devices", "auto"), trainer.get("num_nodes", 1)
-    if isinstance(asked, list):
-        return len(asked) * nodes
-    if str(asked) not in ("auto", "-1"):
-        return (len(asked.rstrip(",").split(",")) if "," in str(asked) else int(asked)) * nodes
+    choice, nodes = trainer.get("devices", "auto"), trainer.get("num_nodes", 1)
+    if isinstance(choice, list):
+        return len(choice) * nodes
+    if str(choice) not in ("auto", "-1"):
+        return (len(choice.rstrip(",").split(",")) if "," in str(choice) else int(choice)) * nodes
     if trainer.get("accelerator", "auto") == "cpu":
         return nodes
     from torch.cuda import device_count  # slow to import
@@ -167,10 +167,10 @@ def _require_apart(validate: Validation, evaluate: Evaluation) -> None:
 
 
 def _require_together(tokenizer: type, model: type) -> None:
-    taken = arguments(model).get("tokenizer")
-    if taken is None:
+    parameter = arguments(model).get("tokenizer")
+    if parameter is None:
         raise UserError(f"{model.__name__} needs the argument tokenizer: end its arguments with **inherited: Inherited")
-    if taken.annotation not in (Any, Parameter.empty) and not fits(tokenizer, taken.annotation):
+    if parameter.annotation not in (Any, Parameter.empty) and not fits(tokenizer, parameter.annotation):
         raise UserError(
             f"{model.__name__} predicts one token per action component, and {tokenizer.__name__} does not make one per "
             "component: choose another tokenizer, such as tokenizer=uniform, or model=decoder, which takes any"

@@ -57,15 +57,15 @@ def with_variant(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
     if name is None:
         return config
     if name not in variants:
-        there = f"{suggestion(str(name), variants) or ':'} the variants are {', '.join(variants)}" if variants else ""
-        raise UserError(f"there is no variant={name}{there or ': choose an experiment that has it'}")
+        hint = f"{suggestion(str(name), variants) or ':'} the variants are {', '.join(variants)}" if variants else ""
+        raise UserError(f"there is no variant={name}{hint or ': choose an experiment that has it'}")
     changes = plain(variants)[name]
     check_value(f"variants.{name}", changes, list[str])
-    given = {override.partition("=")[0]: override for override in overrides}
+    overrides_by_key = {override.partition("=")[0]: override for override in overrides}
     for change in changes:
-        if contrary := given.get(change.partition("=")[0]):
+        if contrary := overrides_by_key.get(change.partition("=")[0]):
             raise UserError(f"variant={name} sets {change}: omit {contrary}")
-    return compose(*(override for key, override in given.items() if key != "variant"), *changes)
+    return compose(*(override for key, override in overrides_by_key.items() if key != "variant"), *changes)
 
 
 def compose_task(task: str, **overrides: Any) -> Node:
@@ -81,13 +81,13 @@ def compose_task(task: str, **overrides: Any) -> Node:
     """
     with _hydra() as loader:
         groups = {name: option for name, option in overrides.items() if loader.get_group_options(f"task/{name}")}
-        chosen = [f"task/{name}={json.dumps(option, ensure_ascii=False)}" for name, option in groups.items()]
-        config = hydra.compose("config", [f"task={task}", *chosen])
+        choices = [f"task/{name}={json.dumps(option, ensure_ascii=False)}" for name, option in groups.items()]
+        config = hydra.compose("config", [f"task={task}", *choices])
         for name, value in overrides.items():
             if name not in groups:
-                listed = json.loads(json.dumps(value))  # tuples as lists
-                key, new = name.removeprefix("+"), name.startswith("+")
-                OmegaConf.update(config.task, key, listed, merge=True, force_add=new)
+                plain_value = json.loads(json.dumps(value))  # tuples as lists
+                key, is_new = name.removeprefix("+"), name.startswith("+")
+                OmegaConf.update(config.task, key, plain_value, merge=True, force_add=is_new)
         return plain(config.task)
 
 
@@ -114,7 +114,7 @@ def offer_axes() -> None:
 @contextmanager
 def _hydra() -> Iterator[ConfigLoader]:
     """Initialise Hydra with `CONF` and restore its global state afterwards, for programs that use Hydra themselves."""
-    before = GlobalHydra.instance().hydra, VersionBase.instance().version_base
+    state = GlobalHydra.instance().hydra, VersionBase.instance().version_base
     GlobalHydra.instance().clear()
     offer_options()
     offer_axes()
@@ -122,7 +122,7 @@ def _hydra() -> Iterator[ConfigLoader]:
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
             yield GlobalHydra.instance().config_loader()
     finally:
-        GlobalHydra.instance().hydra, VersionBase.instance().version_base = before
+        GlobalHydra.instance().hydra, VersionBase.instance().version_base = state
 
 
 def substitutes(task: Node, overrides: Sequence[str]) -> list[str]:
@@ -130,7 +130,7 @@ def substitutes(task: Node, overrides: Sequence[str]) -> list[str]:
 
     Logs a warning for each. Options that the command line names are not replaced: building them raises a UserError.
     """
-    found = []
+    replacements = []
     for name, node in task.items():
         if not is_node(node) or any(override.startswith(f"task/{name}=") for override in overrides):
             continue
@@ -138,5 +138,5 @@ def substitutes(task: Node, overrides: Sequence[str]) -> list[str]:
         if substitute := getattr(kind, "substitute", lambda: None)():
             reason, option = substitute
             log.warning("%s: task/%s=%s instead", reason, name, option)
-            found.append(f"task/{name}={option}")
-    return found
+            replacements.append(f"task/{name}={option}")
+    return replacements

@@ -26,9 +26,9 @@ def differences(one: Any, other: Any, key: str = "") -> list[tuple[str, Any, Any
     """
     if not (isinstance(one, Mapping) and isinstance(other, Mapping)):
         return [] if one == other else [(key, one, other)]
-    found = []
+    entries = []
     for name in dict.fromkeys((*one, *other)):
         if key or (name in one and name in other and name not in NOT_COMPARED):
             values = one.get(name, ABSENT), other.get(name, ABSENT)
-            found += differences(*values, f"{key}.{name}" if key else str(name))
-    return found
+            entries += differences(*values, f"{key}.{name}" if key else str(name))
+    return entries

@@ -53,16 +53,16 @@ class Experiment:
             return cls(nodes)
         default_nodes, changes = plain(default), []
         # Unresolved, so that a value is one difference and not one in each place that refers to it.
-        unresolved, default_unresolved = (OmegaConf.to_container(each, resolve=False) for each in (cfg, default))
-        for key, mine, its in differences(unresolved, default_unresolved):
+        unresolved, default_unresolved = (OmegaConf.to_container(config, resolve=False) for config in (cfg, default))
+        for key, raw, default_raw in differences(unresolved, default_unresolved):
             if key.rpartition(".")[2] == SECRET or key.startswith("chosen."):  # the values of options are compared
                 continue
-            if mine == ABSENT and _class_differs(key, nodes, default_nodes):  # a setting of the default's class
+            if raw == ABSENT and _class_differs(key, nodes, default_nodes):  # a setting of the default's class
                 continue
             value, standard = at(nodes, key), at(default_nodes, key)
             if value != standard or value == ABSENT:  # else a reference and a literal have the same value
-                here, there = at(nodes, key, mine), at(default_nodes, key, its)
-                changes.append({"key": key, "here": here, "default": there})
+                own_value, default_value = at(nodes, key, raw), at(default_nodes, key, default_raw)
+                changes.append({"key": key, "here": own_value, "default": default_value})
         return cls(nodes, _without_secrets(changes))
 
     @cached_property
@@ -78,7 +78,7 @@ class Experiment:
     @cached_property
     def settings(self) -> Settings:
         """The values at the top level of the config."""
-        return Settings(**{each.name: self.nodes[each.name] for each in fields(Settings)})
+        return Settings(**{setting.name: self.nodes[setting.name] for setting in fields(Settings)})
 
     @cached_property
     def collect(self) -> Collection:
@@ -205,8 +205,8 @@ class Experiment:
         saved, content = read_policy(origin) if origin else None, read_content(last) if last else None
         if saved:
             saved.spec.require_input(spec, f"the policy {origin}", "the demonstrations")
-        begun = saved.spec if saved else Spec.from_dict(content["spec"], str(last)) if content else spec
-        spec = replace(spec, robot=begun.robot, image_size=begun.image_size)
+        initial_spec = saved.spec if saved else Spec.from_dict(content["spec"], str(last)) if content else spec
+        spec = replace(spec, robot=initial_spec.robot, image_size=initial_spec.image_size)
         model = _model(self.nodes, spec, saved, weights=bool(origin or last))
         if saved:
             saved.initialize(model)
@@ -246,10 +246,10 @@ class Experiment:
         return self.build("data", folder=store.folder, spec=spec, **windows, **episodes)
 
 
-def _class_differs(key: str, here: Node, there: Node) -> bool:
+def _class_differs(key: str, nodes: Node, default_nodes: Node) -> bool:
     """Return whether the node that contains a dotted key has different classes in two configs."""
     target = f"{key.rpartition('.')[0]}._target_"
-    return at(here, target) != at(there, target)
+    return at(nodes, target) != at(default_nodes, target)
 
 
 def _without_secrets(values: Any) -> Any:
@@ -260,9 +260,9 @@ def _without_secrets(values: Any) -> Any:
 
 def plain(node: DictConfig) -> Node:
     """Convert a composed node to dicts and lists."""
-    plain = OmegaConf.to_container(node, resolve=True)
-    assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items()}
+    container = OmegaConf.to_container(node, resolve=True)
+    assert isinstance(container, dict)
+    return {str(key): value for key, value in container.items()}
 
 
 def make_environment(task: Node) -> Environment:
@@ -324,8 +324,8 @@ def training_policy(precision: str, model: Model) -> Policy:
         import torch
 
         torch.cuda.set_device(device)
-    here = {"device": device.type, "precision": precision, "compile": False, "lanes": 1}
-    return build({"_target_": "vla.policy.Policy", **here}, "policy", model=model, spec=model.spec)
+    options = {"device": device.type, "precision": precision, "compile": False, "lanes": 1}
+    return build({"_target_": "vla.policy.Policy", **options}, "policy", model=model, spec=model.spec)
 
 
 def _policy_folder(name: str | None) -> Path | None:
@@ -355,5 +355,5 @@ def _without_weights(model: Node) -> Node:
     """Return a model node without pretrained weights, also of its encoders: the policy contains the trained ones."""
     nodes = {name: node for name, node in model.items() if isinstance(node, dict)}
     parts = {name: _without_weights(node) for name, node in nodes.items() if name in ("image", "context", "network")}
-    none = {"pretrained": False, "trunk": None}
-    return model | parts | {name: value for name, value in none.items() if name in model}
+    untrained = {"pretrained": False, "trunk": None}
+    return model | parts | {name: value for name, value in untrained.items() if name in model}

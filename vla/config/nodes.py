@@ -96,8 +96,8 @@ class Evaluation:
 
     def __post_init__(self) -> None:
         """Require that every condition has a name of its own."""
-        changed = [*self.conditions, *(name for name, _ in _separate(self.one_by_one))]
-        for name, count in Counter([IN_DISTRIBUTION, *changed, *self.of_agents]).items():
+        names = [*self.conditions, *(name for name, _ in _split_levels(self.one_by_one))]
+        for name, count in Counter([IN_DISTRIBUTION, *names, *self.of_agents]).items():
             if count > 1:
                 raise UserError(f"evaluate has {count} conditions with the name {name}: rename one")
 
@@ -114,7 +114,7 @@ class Evaluation:
     @property
     def of_agents(self) -> list[str]:
         """The conditions that change the agent rather than the task."""
-        return [*(f"without_{each}" for each in self.without), *self.networks, *([NEAREST] if self.nearest else [])]
+        return [*(f"without_{name}" for name in self.without), *self.networks, *([NEAREST] if self.nearest else [])]
 
 
 @dataclass(frozen=True)
@@ -193,24 +193,24 @@ def conditions(together: Mapping[str, Changes], one_by_one: Mapping[str, Any]) -
         together: condition → overrides.
         one_by_one: level → argument of the task → part → value.
     """
-    return {**together, **dict(_separate(one_by_one))}
+    return {**together, **dict(_split_levels(one_by_one))}
 
 
-def _separate(one_by_one: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+def _split_levels(one_by_one: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
     """Return name and overrides of every part; names may repeat."""
     levels: dict[tuple[str, str], dict[str, Any]] = {}
     for level, overrides in one_by_one.items():
         for argument, parts in overrides.items():
             for part, value in parts.items():
                 levels.setdefault((argument, part), {})[level] = value
-    found = list[tuple[str, dict[str, Any]]]()
+    pairs = list[tuple[str, dict[str, Any]]]()
     for (argument, part), values in levels.items():
         if all(value is None for value in values.values()):
             continue
         if len(values) > 1 and len({repr(value) for value in values.values()}) == 1:
             values = {"": next(iter(values.values()))}
-        found += [(f"{part}_{level}" if level else part, {argument: {part: value}}) for level, value in values.items()]
-    return found
+        pairs += [(f"{part}_{level}" if level else part, {argument: {part: value}}) for level, value in values.items()]
+    return pairs
 
 
 def with_changes(node: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

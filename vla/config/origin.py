@@ -52,24 +52,24 @@ def _commits() -> dict[str, str]:
     packages = {"vla", *option_packages(), *(name.partition(".")[0] for name in trusted())}
     specs = [find_spec(package) for package in sorted(packages)]
     places = [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
-    found = dict[str, str]()
+    trees = dict[str, str]()
     for folder in (*places, *config_folders()):
         # A package that is installed into an ignored folder of a tree does not belong to it.
         if not folder.is_dir() or _git(folder, "check-ignore", "-q", ".") is not None:
             continue
-        if (known := _git(folder, "rev-parse", "--show-toplevel", "HEAD")) is not None:
-            tree, commit = known.splitlines()
+        if (output := _git(folder, "rev-parse", "--show-toplevel", "HEAD")) is not None:
+            tree, commit = output.splitlines()
             # Files that git does not know can be chosen, too.
-            if _git(folder, "--no-optional-locks", "status", "--porcelain", "--", ".") or DIRTY in found.get(tree, ""):
+            if _git(folder, "--no-optional-locks", "status", "--porcelain", "--", ".") or DIRTY in trees.get(tree, ""):
                 commit = f"{commit} {DIRTY}"
-            found[tree] = commit
-    return {Path(tree).name: commit for tree, commit in found.items()}
+            trees[tree] = commit
+    return {Path(tree).name: commit for tree, commit in trees.items()}
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
     """Return what a git command prints about a folder, or None where it fails."""
     try:
-        done = subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, timeout=SECONDS)
+        result = subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, timeout=SECONDS)
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return done.stdout if done.returncode == 0 else None
+    return result.stdout if result.returncode == 0 else None

@@ -60,7 +60,7 @@ def config_folders() -> tuple[Path, ...]:
 @cache
 def option_folders() -> tuple[tuple[str, Path], ...]:
     """Return (package, folder of options) of installed packages; raise a UserError if one has no such folder."""
-    found = []
+    folders = []
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.value):
         package, *parts = entry.value.split(".")
         spec = find_spec(package)
@@ -71,8 +71,8 @@ def option_folders() -> tuple[tuple[str, Path], ...]:
                 f"the installed package {package} names {entry.value} as its options, which is not a folder: its wheel "
                 "must include the YAML files"
             )
-        found.append((package, folder.resolve()))
-    return tuple(found)
+        folders.append((package, folder.resolve()))
+    return tuple(folders)
 
 
 def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> None:
@@ -87,12 +87,12 @@ def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> Non
     if not isinstance(packages, list):
         raise UserError(f"trust must be a list of packages, as in trust=[mypackage], got {packages!r}")
     used = [name for name in used if name != MISSING]
-    named = [*packages, *_names(TRUST), *used]
-    for name in named:
+    names = [*packages, *_names(TRUST), *used]
+    for name in names:
         _require_trustworthy("package" if name in used else "trust", name)
-    offering = option_packages()
-    classes = {each for each in chosen if isinstance(each, str) and each.partition(".")[0] in offering}
-    os.environ[TRUSTED] = ",".join(sorted({*named, *classes}))
+    providers = option_packages()
+    classes = {target for target in chosen if isinstance(target, str) and target.partition(".")[0] in providers}
+    os.environ[TRUSTED] = ",".join(sorted({*names, *classes}))
 
 
 @contextmanager
@@ -102,14 +102,14 @@ def trusting(packages: Sequence[str]) -> Iterator[None]:
         raise UserError(f"trust must be a list of packages, as in trust=[{packages!r}], got {packages!r}")
     for name in packages:
         _require_trustworthy("trust", name)
-    before = os.environ.get(TRUSTED)
+    old_value = os.environ.get(TRUSTED)
     os.environ[TRUSTED] = ",".join(sorted({*trusted(), *packages}))
     try:
         yield
     finally:
         del os.environ[TRUSTED]
-        if before is not None:
-            os.environ[TRUSTED] = before
+        if old_value is not None:
+            os.environ[TRUSTED] = old_value
 
 
 def trusted() -> list[str]:
@@ -139,13 +139,13 @@ def can_be_trusted(package: str) -> bool:
     """
     if not package.isidentifier() or package.startswith("_") or package in sys.stdlib_module_names:
         return False
-    return all(map(_made_for, packages_distributions().get(package, ())))
+    return all(map(_depends_on_vla, packages_distributions().get(package, ())))
 
 
 def _names(variable: str) -> list[str]:
-    return [name for each in os.environ.get(variable, "").split(",") if (name := each.strip())]
+    return [name for part in os.environ.get(variable, "").split(",") if (name := part.strip())]
 
 
-def _made_for(distribution: str) -> bool:
-    needed = [requirement for requirement in requires(distribution) or () if "extra ==" not in requirement]
-    return any(re.match(r"(vla|gymnasium)\b(?![.-])", requirement, re.IGNORECASE) for requirement in needed)
+def _depends_on_vla(distribution: str) -> bool:
+    requirements = [requirement for requirement in requires(distribution) or () if "extra ==" not in requirement]
+    return any(re.match(r"(vla|gymnasium)\b(?![.-])", requirement, re.IGNORECASE) for requirement in requirements)

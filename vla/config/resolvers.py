@@ -43,14 +43,14 @@ def recorded(name: str, *, _root_: DictConfig) -> Any:
 
     Raises a UserError if the expert reads no recording, or the recording does not exist.
     """
-    found = _recording(json.dumps(OmegaConf.to_container(_root_.expert, resolve=True)))
+    recording = _recording(json.dumps(OmegaConf.to_container(_root_.expert, resolve=True)))
     if name not in ("low", "high"):
-        value = resolved(getattr(found, name), "the recording")
+        value = resolved(getattr(recording, name), "the recording")
         return ListConfig(value) if isinstance(value, list) else value
     action = list(_root_.task.action)
-    if unknown := [each for each in action if each not in found.bounds]:
-        raise UserError(f"task.action names {', '.join(unknown)}: the recording has only {', '.join(found.bounds)}")
-    return ListConfig([found.bounds[each][name == "high"] for each in action])
+    if unknown := [component for component in action if component not in recording.bounds]:
+        raise UserError(f"task.action names {', '.join(unknown)}: the recording has only {', '.join(recording.bounds)}")
+    return ListConfig([recording.bounds[component][name == "high"] for component in action])
 
 
 @lru_cache(maxsize=8)  # every value of a task asks for it

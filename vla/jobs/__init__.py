@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from vla.config.experiment import Experiment
 
 
-def _own(name: str, kind: str) -> Group:
+def _plain_group(name: str, kind: str) -> Group:
     return Group(name, (f"vla.config.nodes.{kind}",), plain=True)
 
 
@@ -34,14 +34,14 @@ JOBS = {
         without_agent=("tokenizer", "model", "policy"),
         without_checkpoint=("expert", "data", "learner", "trainer", "logger"),
     ),
-    "improve": Job((*TRAINING, "policy", "recorder", _own("improve", "Rounds"))),
+    "improve": Job((*TRAINING, "policy", "recorder", _plain_group("improve", "Rounds"))),
     "deploy": Job(("tokenizer", "model", "policy", "agent", "deploy"), adopts=True),
     "export": Job(("task", "expert", "cluster", "tokenizer", "model", "policy", "export"), adopts=True),
-    "inspect": Job((_own("inspect", "Inspection"),)),
-    "preview": Job(("task", "expert", "recorder", _own("preview", "Preview"))),
-    "report": Job((_own("report", "ReportedRuns"),)),
-    "plan": Job((_own("plan", "Power"),)),
-    "benchmark": Job((*TRAINING, "policy", _own("benchmark", "Benchmark")), adopts=True),
+    "inspect": Job((_plain_group("inspect", "Inspection"),)),
+    "preview": Job(("task", "expert", "recorder", _plain_group("preview", "Preview"))),
+    "report": Job((_plain_group("report", "ReportedRuns"),)),
+    "plan": Job((_plain_group("plan", "Power"),)),
+    "benchmark": Job((*TRAINING, "policy", _plain_group("benchmark", "Benchmark")), adopts=True),
 }
 
 
@@ -54,14 +54,14 @@ def find(name: str) -> Job:
         return JOBS[name]
     require_trusted("job", name)
     try:
-        found: Any = import_module(name) if is_trusted(name) else None
+        module: Any = import_module(name) if is_trusted(name) else None
     except ModuleNotFoundError as error:
         if not f"{name}.".startswith(f"{error.name}."):  # of another import
             raise
-        found = None
-    if not hasattr(found, "JOB"):
+        module = None
+    if not hasattr(module, "JOB"):
         raise UserError(f"there is no job '{name}'; --help lists the jobs")
-    return found.JOB
+    return module.JOB
 
 
 def builds_world(experiment: Experiment) -> bool:

@@ -26,24 +26,22 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
 
     Raises a UserError if the store has episodes of another experiment, or collection fails.
     """
-    wanted = experiment.collect
-    if wanted.seed + wanted.episodes > FIRST_SEED:
+    collection = experiment.collect
+    if collection.seed + collection.episodes > FIRST_SEED:
         raise UserError(f"collect.seed + collect.episodes must be at most {FIRST_SEED}: later seeds are for evaluation")
     store = complete_store(experiment)
     if store is None:
         store = _fill(experiment)
     else:
         folder = experiment["expert"].get("folder")
-        if folder and Path(folder).exists() and not store.derived and (recorded := _source(experiment)[2]):
-            recorded.require_held(store)
+        if folder and Path(folder).exists() and not store.derived and (recordings := _source(experiment)[2]):
+            recordings.require_held(store)
         if store.derived:
             store.spec.require_input(experiment.world().spec, f"the episode store {store.folder}", "the task")
-        if others := [key for key, node in experiment.source.items() if store.lacks(key, node)]:
-            log.warning(
-                "%s was derived from demonstrations with another %s", store.folder, " and another ".join(others)
-            )
-        log.info("%s: %s of %d, none new", store.folder, counted(wanted.episodes, "episode"), len(store.episodes))
-    return EpisodeStore(store.folder, wanted.episodes)
+        if keys := [key for key, node in experiment.source.items() if store.lacks(key, node)]:
+            log.warning("%s was derived from demonstrations with another %s", store.folder, " and another ".join(keys))
+        log.info("%s: %s of %d, none new", store.folder, counted(collection.episodes, "episode"), len(store.episodes))
+    return EpisodeStore(store.folder, collection.episodes)
 
 
 def demonstration_spec(experiment: Experiment) -> Spec:
@@ -57,42 +55,42 @@ def complete_store(experiment: Experiment) -> EpisodeStore | None:
 
     Raises a UserError if the store has another task, expert, first seed, or loss of image compression.
     """
-    wanted = experiment.collect
-    if not is_store(Path(wanted.folder)):
+    collection = experiment.collect
+    if not is_store(Path(collection.folder)):
         return None
-    store = EpisodeStore(Path(wanted.folder))
+    store = EpisodeStore(Path(collection.folder))
     store.require(experiment.source)
-    store.require_codec(wanted.codec)
-    store.require_first_seed(wanted.seed)
-    return store if len(store.episodes) >= wanted.episodes else None
+    store.require_codec(collection.codec)
+    store.require_first_seed(collection.seed)
+    return store if len(store.episodes) >= collection.episodes else None
 
 
 def _source(experiment: Experiment) -> tuple[Environment | SpecOnly, Spec, ImportedDemonstrations | None]:
     """Return the closed world, the spec of the demonstrations, and the recordings to import: None if an expert acts."""
     world = experiment.world()
     expert = experiment.build("expert", spec=world.spec)
-    recorded = expert if isinstance(expert, ImportedDemonstrations) else None
-    return world, recorded.spec if recorded else world.spec, recorded
+    recordings = expert if isinstance(expert, ImportedDemonstrations) else None
+    return world, recordings.spec if recordings else world.spec, recordings
 
 
 def _fill(experiment: Experiment) -> EpisodeStore:
-    wanted, cluster = experiment.collect, experiment.cluster()
-    world, spec, recorded = _source(experiment)
-    if recorded is not None:
-        recorded.require_enough(wanted.episodes)
-        if wanted.seed:
-            raise UserError(f"collect.seed={wanted.seed}: recorded episodes are numbered from 0, so omit it")
-    store = EpisodeStore.create_or_open(Path(wanted.folder), spec, experiment.source, wanted.codec)
-    if recorded is not None:
-        added = recorded.fill(store, wanted.episodes)
+    collection, cluster = experiment.collect, experiment.cluster()
+    world, spec, recordings = _source(experiment)
+    if recordings is not None:
+        recordings.require_enough(collection.episodes)
+        if collection.seed:
+            raise UserError(f"collect.seed={collection.seed}: recorded episodes are numbered from 0, so omit it")
+    store = EpisodeStore.create_or_open(Path(collection.folder), spec, experiment.source, collection.codec)
+    if recordings is not None:
+        added = recordings.fill(store, collection.episodes)
         log.info("%s: %s, %d of them new", store.folder, counted(len(store.episodes), "recorded episode"), added)
         return store
     makers = experiment.make_environment(), experiment.make_expert()
     multitask = world if isinstance(world, Multitask) else None
-    summary = collect(store, *makers, wanted.episodes, cluster, wanted.seed, multitask)
+    summary = collect(store, *makers, collection.episodes, cluster, collection.seed, multitask)
     if len(summary.tasks) > 1:
-        for task, (solved, tried) in summary.tasks.items():
-            log.info("%s: %s of %s", task, counted(solved, "episode"), counted(tried, "seed"))
+        for task, (successes, seeds) in summary.tasks.items():
+            log.info("%s: %s of %s", task, counted(successes, "episode"), counted(seeds, "seed"))
     failures = ", ".join(f"{count} {cause}" for cause, count in summary.failures.items()) or "none"
     log.info(
         "%s: %s, %d of them new in %.0f s; expert success %.1f %%, failures: %s",

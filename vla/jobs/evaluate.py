@@ -68,7 +68,7 @@ def run(experiment: Experiment) -> float | None:
     """
     require_possible(experiment)
     agent = experiment.make_agent()
-    checkpoint = None if agent else experiment.checkpoint or _trained(experiment)
+    checkpoint = None if agent else experiment.checkpoint or _train(experiment)
     if checkpoint is agent is None:
         return None
     if experiment.playable:
@@ -78,7 +78,7 @@ def run(experiment: Experiment) -> float | None:
     return evaluate_open_loop(experiment, checkpoint)
 
 
-def _trained(experiment: Experiment) -> Path | None:
+def _train(experiment: Experiment) -> Path | None:
     """Train; return None in all but the first process, or if no episodes are left to evaluate on."""
     from vla.jobs.train import train
 
@@ -97,9 +97,9 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
     """
     output, identity = experiment.output, _identity(experiment, checkpoint)
     weights = identity["weights"]
-    if checkpoint and (known := cached_success(output, experiment.config, checkpoint, weights)) is not None:
+    if checkpoint and (success := cached_success(output, experiment.config, checkpoint, weights)) is not None:
         _renew_page(output)
-        return known
+        return success
     statements, conclusions = _statements(experiment), list[str]()
     _ = experiment.origin  # determine it now, before the code may change
     try:
@@ -109,14 +109,14 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
             if checkpoint and read_policy(checkpoint).training.weights != weights:  # workers read them as they start
                 raise UserError(f"{checkpoint} was replaced while it was evaluated: run the evaluation again")
             report = reports[IN_DISTRIBUTION]
-            said = [each.say(report) for each in statements]
-            conclusions += [*said, str(report)]
+            verdicts = [statement.say(report) for statement in statements]
+            conclusions += [*verdicts, str(report)]
             with writing(output / REPORT):
-                facts = {**_facts(experiment, checkpoint), "weights": weights, "statements": said}
+                facts = {**_facts(experiment, checkpoint), "weights": weights, "statements": verdicts}
                 _write(experiment, checkpoint, reports, facts)
             if errors := _errors(reports):  # what was played is kept, so that the same command plays only these again
-                again = f"the same evaluation with output={output} plays only these again"
-                raise UserError(f"{counted(errors, 'episode')} ended in an error, see {output / REPORT}: {again}")
+                hint = f"the same evaluation with output={output} plays only these again"
+                raise UserError(f"{counted(errors, 'episode')} ended in an error, see {output / REPORT}: {hint}")
     finally:
         for line in conclusions:  # after whatever was logged, because scripts read the last line
             print(printable(line))
@@ -163,18 +163,18 @@ def _conditions(experiment: Experiment, make_agent: AgentFactory) -> dict[str, t
 
     The other agents are this one without a modality or at the other end of a network, and the nearest demonstration.
     """
-    wanted, world = experiment.evaluate, experiment.make_environment()
-    found = {IN_DISTRIBUTION: (world, make_agent)}
-    for name, changes in wanted.changes.items():
+    options, world = experiment.evaluate, experiment.make_environment()
+    conditions = {IN_DISTRIBUTION: (world, make_agent)}
+    for name, changes in options.changes.items():
         if with_changes(experiment["task"], changes) != experiment["task"]:
-            found[name] = experiment.make_environment(changes), make_agent
-    for each in wanted.without:
-        found[f"without_{each}"] = world, partial(make_without, make_agent, each)
-    if wanted.nearest:
-        found[NEAREST] = world, partial(make_nearest, Path(wanted.nearest).resolve())
-    for name, node in wanted.networks.items():
-        found[name] = world, partial(make_over_network, make_agent, build(node, NETWORK))
-    return found
+            conditions[name] = experiment.make_environment(changes), make_agent
+    for modality in options.without:
+        conditions[f"without_{modality}"] = world, partial(make_without, make_agent, modality)
+    if options.nearest:
+        conditions[NEAREST] = world, partial(make_nearest, Path(options.nearest).resolve())
+    for name, node in options.networks.items():
+        conditions[name] = world, partial(make_over_network, make_agent, build(node, NETWORK))
+    return conditions
 
 
 def _play(
@@ -185,36 +185,36 @@ def _play(
     Episodes in `played` are not played again; others are added to it. With `evaluate.until` the first condition stops
     once all statements are decided; the others play the seeds of the first, and stop once their difference is decided.
     """
-    wanted, recordings = experiment.evaluate, experiment.output.resolve() / RECORDINGS
+    options, recordings = experiment.evaluate, experiment.output.resolve() / RECORDINGS
     make_agent, make_recorder = experiment.make_agent() or make_policy, experiment.make_recorder(recordings)
     assert make_agent is not None, "there is a checkpoint"
     if make_recorder:
         recordings.mkdir(exist_ok=True)
     if not any(played.results.values()):
         clear(recordings)
-    world = experiment.world() if wanted.until else None
+    world = experiment.world() if options.until else None
     turns = len(world.tasks) if isinstance(world, Multitask) else 1
     lanes = 1 if _is_shared(experiment) else (experiment["policy"] or {}).get("lanes", 1)  # shared: workers are lanes
-    play = partial(evaluate, cluster=experiment.cluster(), turns=turns, lanes=lanes, recordings=wanted.recordings)
-    conditions, reports, seeds = _conditions(experiment, make_agent), dict[str, Report](), list(wanted.seeds)
-    until = (lambda report: all(each.is_decided(report) for each in statements)) if statements else None
+    play = partial(evaluate, cluster=experiment.cluster(), turns=turns, lanes=lanes, recordings=options.recordings)
+    conditions, reports, seeds = _conditions(experiment, make_agent), dict[str, Report](), list(options.seeds)
+    until = (lambda report: all(statement.is_decided(report) for statement in statements)) if statements else None
     for number, (name, (make_environment, make_its_agent)) in enumerate(conditions.items(), 1):
-        first = name == IN_DISTRIBUTION
-        label = "as configured" if first else name
+        is_first = name == IN_DISTRIBUTION
+        label = "as configured" if is_first else name
         reports[name] = play(
-            *(make_environment, make_its_agent, make_recorder if first else None, seeds),
+            *(make_environment, make_its_agent, make_recorder if is_first else None, seeds),
             name=f"{label} ({number} of {len(conditions)})" if len(conditions) > 1 else label,
-            until=until if wanted.until else None,
+            until=until if options.until else None,
             known=played.results[name],
             keep=partial(played.add, name),
         )
-        if first:
+        if is_first:
             seeds = [result.seed for result in reports[name].results]
-            until = partial(differs_clearly, reports[name], wanted.margin, len(conditions) - 1)
+            until = partial(differs_clearly, reports[name], options.margin, len(conditions) - 1)
     tiers = experiment["task"].get("tiers") or {}  # of worlds that have them
     reports = {name: replace(report, tiers=tiers) for name, report in reports.items()}
     training = reports[IN_DISTRIBUTION]  # also the report of conditions that change nothing, which were not played
-    return {name: reports.get(name, training) for name in (IN_DISTRIBUTION, *wanted.changes, *reports)}
+    return {name: reports.get(name, training) for name in (IN_DISTRIBUTION, *options.changes, *reports)}
 
 
 def require_possible(experiment: Experiment) -> None:
@@ -223,111 +223,111 @@ def require_possible(experiment: Experiment) -> None:
     Raises a UserError if the run to compare with or a store is missing, there is nothing to decide, a network or a
     condition is impossible, or the episodes selected the weights or are not distinct.
     """
-    wanted, settings = experiment.evaluate, experiment.settings
+    options, settings = experiment.evaluate, experiment.settings
     for name in (settings.checkpoint, settings.pretrained):
         if name:
-            require_unseen(name, "evaluate.seed", wanted.seeds)  # whatever `validate` is now
+            require_unseen(name, "evaluate.seed", options.seeds)  # whatever `validate` is now
     _statements(experiment)
-    for node in wanted.networks.values():
+    for node in options.networks.values():
         network = build(node, NETWORK)
         if (chunking := (experiment.nodes.get("policy") or {}).get("chunking")) and not experiment.nodes.get("agent"):
             method = locate("policy.chunking._target_", chunking["_target_"])
             delays = Delays(1 / experiment.world().spec.control_hz)
             delays.add(network.latency + network.jitter)
             require_fit(method, experiment["model"], delays.longest)
-    if not experiment.playable and wanted.conditions:
+    if not experiment.playable and options.conditions:
         raise UserError("evaluate.conditions change a world, and a recording has none: omit them")
-    if wanted.nearest is not None:
-        open_memory(Path(wanted.nearest), None, experiment.world().spec)
+    if options.nearest is not None:
+        open_memory(Path(options.nearest), None, experiment.world().spec)
     output = Path(settings.output)  # not created yet
     if settings.job != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
         raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
     # Worlds take time to compile: one is built for all conditions that change the same arguments; nodes were checked.
-    kinds = {frozenset(changes): (name, changes) for name, changes in reversed(wanted.changes.items())}
+    kinds = {frozenset(changes): (name, changes) for name, changes in reversed(options.changes.items())}
     for name, changes in kinds.values() if experiment.playable else ():
         try:
             with closing(experiment.make_environment(changes)()) as world, world.blind():
-                world.reset(wanted.seed)  # fails, for instance, with more blocks than colours
+                world.reset(options.seed)  # fails, for instance, with more blocks than colours
         except ValueError as error:
             raise UserError(f"condition {name} of the evaluation: {error}") from error
     if hasattr(experiment.kind("task"), "distinct"):
-        for name, changes in {IN_DISTRIBUTION: {}, **wanted.changes}.items():
+        for name, changes in {IN_DISTRIBUTION: {}, **options.changes}.items():
             with closing(experiment.make_environment(changes)()) as world:
-                _require_distinct(name, world, wanted)
+                _require_distinct(name, world, options)
 
 
-def _require_distinct(condition: str, world: Any, wanted: Evaluation) -> None:
+def _require_distinct(condition: str, world: Any, options: Evaluation) -> None:
     """Raise a UserError if an evaluation would play an episode twice in the world of a condition."""
-    count: int = world.distinct(wanted.seeds)
-    if count < wanted.episodes:
-        where = "" if condition == IN_DISTRIBUTION else f" in the condition {condition}"
+    count: int = world.distinct(options.seeds)
+    if count < options.episodes:
+        place = "" if condition == IN_DISTRIBUTION else f" in the condition {condition}"
         raise UserError(
-            f"evaluate.episodes={wanted.episodes}: there are {count} different ones{where}, and no interval may count "
+            f"evaluate.episodes={options.episodes}: there are {count} different ones{place}, and no interval may count "
             f"one twice: set evaluate.episodes={count}"
         )
 
 
 def _statements(experiment: Experiment) -> list[Statement]:
     """Build the statements to decide; raise a UserError if the run to compare with is missing, or nothing to decide."""
-    wanted, found = experiment.evaluate, list[Statement]()
-    if wanted.bar is not None:
-        found.append(AgainstBar(wanted.bar))
-    if wanted.against is not None:
-        found.append(_against(experiment, wanted.against))
-    if wanted.until and not (found or wanted.changes or wanted.of_agents):
+    options, statements = experiment.evaluate, list[Statement]()
+    if options.bar is not None:
+        statements.append(AgainstBar(options.bar))
+    if options.against is not None:
+        statements.append(_against_run(experiment, options.against))
+    if options.until and not (statements or options.changes or options.of_agents):
         raise UserError(
             "evaluate.until=decided needs something to decide: evaluate.bar=0.95, evaluate.against=RUN, or conditions, "
             "as in evaluate=suite"
         )
-    if not experiment.playable and (found or wanted.until or wanted.of_agents):
+    if not experiment.playable and (statements or options.until or options.of_agents):
         raise UserError(
             "evaluate.bar, against, until, without, nearest and networks need a success rate, which recordings lack: "
             "omit them"
         )
-    return found
+    return statements
 
 
-def _against(experiment: Experiment, run: str) -> AgainstRun:
+def _against_run(experiment: Experiment, run: str) -> AgainstRun:
     """Build the comparison with another run; raise a UserError if it has no report or no episode in common."""
     report = require_run(Path(run)).report
     if report is None:
         raise UserError(f"evaluate.against={run} has no report.json to compare with: evaluate that run first")
-    theirs = {result.seed: result for result in report.per_episode}
+    results = {result.seed: result for result in report.per_episode}
     if not any(result.draws for result in report.per_episode) and report.config.get("task") != experiment["task"]:
-        theirs = {}  # without draws to compare, equal seeds are the same episodes in the same task only
-    statement = AgainstRun(run, theirs, experiment.evaluate.margin, report.anytime)
+        results = {}  # without draws to compare, equal seeds are the same episodes in the same task only
+    statement = AgainstRun(run, results, experiment.evaluate.margin, report.anytime)
     statement.require_common(experiment.evaluate.seeds)
     return statement
 
 
 def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, Report], facts: dict[str, Any]) -> None:
     """Write all results of an evaluation; `facts` are further entries of its report."""
-    output, wanted, report = experiment.output, experiment.evaluate, reports[IN_DISTRIBUTION]
-    others = {name: each for name, each in reports.items() if name != IN_DISTRIBUTION}
-    compared = compare_conditions(reports, wanted.margin)
+    output, options, report = experiment.output, experiment.evaluate, reports[IN_DISTRIBUTION]
+    conditions = {name: other for name, other in reports.items() if name != IN_DISTRIBUTION}
+    compared = compare_conditions(reports, options.margin)
     save_config(output, experiment.config, experiment.changes)
     recording = output / RECORDING
-    for earlier in (recording, output / SUITE):
-        earlier.unlink(missing_ok=True)
+    for file in (recording, output / SUITE):
+        file.unlink(missing_ok=True)
     if experiment["recorder"] and not _errors(reports):  # else the same command continues
         with warn_on_error(recording):
-            facts["recorded"] = merge_recordings(report, output / RECORDINGS, recording, wanted.recordings)
+            facts["recorded"] = merge_recordings(report, output / RECORDINGS, recording, options.recordings)
     with warn_on_error(output / PLOT):
         (output / PLOT).unlink(missing_ok=True)  # of an earlier evaluation
         plot_report(report, output / PLOT)
-    if others:
+    if conditions:
         with warn_on_error(output / SUITE):
             plot_conditions(reports, output / SUITE)
         show(conditions_table(reports, compared))
-        secondary = secondary_table({(name,): each for name, each in compared.items() if reports[name] is not report})
+        secondary = secondary_table({(name,): tests for name, tests in compared.items() if reports[name] is not report})
         if secondary.rows:
             show(secondary)
-    used = str(checkpoint) if checkpoint else None
+    policy = str(checkpoint) if checkpoint else None
     # Last, because its existence marks the evaluation as finished.
-    write_report(report, output / REPORT, used, experiment.config, facts, others, compared)
+    write_report(report, output / REPORT, policy, experiment.config, facts, conditions, compared)
     if "recorded" in facts:  # only now: without a report the same command merges them again
         with warn_on_error(output / RECORDINGS):
-            keep_pictures(report, output / RECORDINGS, wanted.recordings, {*facts["recorded"]})
+            keep_pictures(report, output / RECORDINGS, options.recordings, {*facts["recorded"]})
     page = None
     with warn_on_error(output / PAGE):
         page = write_page(output)
@@ -336,7 +336,7 @@ def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, R
 
 def _errors(reports: Mapping[str, Report]) -> int:
     """Return the number of errors; conditions that are equal to the training condition share its report."""
-    return sum(len(each.errors) for each in {id(each): each for each in reports.values()}.values())
+    return sum(len(report.errors) for report in {id(report): report for report in reports.values()}.values())
 
 
 def _facts(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]:

@@ -43,50 +43,50 @@ def run(experiment: Experiment) -> float:
     Raises a UserError if the expert cannot label, seeds are not new, or the folder has a round of another policy.
     """
     seeds = _require_possible(experiment)
-    known = complete_store(experiment)
-    for store in (*([known] if known else ()), *map(EpisodeStore, experiment.collect.more or ())):
+    main_store = complete_store(experiment)
+    for store in (*([main_store] if main_store else ()), *map(EpisodeStore, experiment.collect.more or ())):
         require_new(seeds, store)
     with training_lock(experiment.output):
         _save_config(experiment)
         require_new(seeds, demonstrations(experiment))
-        return _improved(experiment, seeds)
+        return _improve(experiment, seeds)
 
 
-def _improved(experiment: Experiment, seeds: range) -> float:
-    asked, output = experiment.options(Rounds), experiment.output
+def _improve(experiment: Experiment, seeds: range) -> float:
+    options, output = experiment.options(Rounds), experiment.output
     checkpoint, stores = experiment.pretrained, list[Path]()
-    if (report := read_report(output)) and (finished := at(report.config, "improve.rounds", 0)) < asked.rounds:
-        archive_evaluation(output, finished)
+    if (report := read_report(output)) and (count := at(report.config, "improve.rounds", 0)) < options.rounds:
+        archive_evaluation(output, count)
     if checkpoint is None:
-        checkpoint = _trained(experiment.with_values({"job": "train", "output": str(output / "round_0")}))
-    for number in range(1, asked.rounds + 1):
+        checkpoint = _train(experiment.with_values({"job": "train", "output": str(output / "round_0")}))
+    for number in range(1, options.rounds + 1):
         folder = output / f"round_{number}"
-        store = _labelled(experiment, checkpoint, folder / EPISODES, seeds[(number - 1) * asked.episodes])
+        store = _labelled_store(experiment, checkpoint, folder / EPISODES, seeds[(number - 1) * options.episodes])
         stores.append(store.folder)
         successes = sum(entry.success for entry in store.episodes)
         log.info("round %d: success in %d of %s", number, successes, counted(len(store.episodes), "labelled episode"))
-        checkpoint = _trained(_round(experiment, checkpoint, folder, stores))
+        checkpoint = _train(_round(experiment, checkpoint, folder, stores))
     return evaluated(experiment, checkpoint)
 
 
 def _save_config(experiment: Experiment) -> None:
     """Save the config for `resume=`; raise a UserError if the folder has rounds of another training or length."""
-    saved = read_run(experiment.output).config
-    if saved.get("job") == "improve":
+    saved_config = read_run(experiment.output).config
+    if saved_config.get("job") == "improve":
         # Later trainings continue the earlier ones, which must not get another length.
-        begun = is_store(experiment.output / "round_1" / EPISODES)
+        has_rounds = is_store(experiment.output / "round_1" / EPISODES)
         lengths = [f"trainer.{name}" for name in LENGTHS] if experiment.pretrained is None else []
-        further = (*lengths, "improve.steps") if begun else ()
-        require_identity(saved, experiment.config, experiment.output, further)
-    if saved != experiment.config:  # else a new date would suggest that the rounds began again
+        keys = (*lengths, "improve.steps") if has_rounds else ()
+        require_identity(saved_config, experiment.config, experiment.output, keys)
+    if saved_config != experiment.config:  # else a new date would suggest that the rounds began again
         save_config(experiment.output, experiment.config, experiment.changes)
 
 
 def _require_possible(experiment: Experiment) -> range:
     """Return the seeds of all rounds; raise a UserError if evaluation reserves them, or the rounds cannot be played."""
     require_possible(experiment)
-    asked = experiment.options(Rounds)
-    seeds = asked.seeds
+    options = experiment.options(Rounds)
+    seeds = options.seeds
     if seeds.stop > FIRST_SEED:
         raise UserError(f"improve.seed={seeds.start}: its rounds reach {FIRST_SEED}, where evaluation begins: lower it")
     if (Path(experiment.settings.output) / LAST).exists():
@@ -101,18 +101,18 @@ def _require_possible(experiment: Experiment) -> range:
         require_memoryless(expert)
         if (policy := experiment.pretrained) is not None:
             read_policy(policy).spec.require_input(environment.spec, f"the checkpoint {policy}", "the task")
-        with closing(experiment.make_environment(asked.changes)()) as changed:
-            environment.spec.require(changed.spec, "the task", "the task with improve.changes")
-            with changed.blind():
-                changed.reset(seeds.start)
+        with closing(experiment.make_environment(options.changes)()) as variant:
+            environment.spec.require(variant.spec, "the task", "the task with improve.changes")
+            with variant.blind():
+                variant.reset(seeds.start)
     return seeds
 
 
 def _require_further_episodes(experiment: Experiment, policy: Path) -> None:
     """Raise a UserError if the policy was trained on further stores, such as rounds, and `collect.more` is not set."""
-    further = at(read_policy(policy).config, "collect.more", None)
-    if isinstance(further, list) and further and experiment.collect.more is None:
-        names = ",".join(map(str, further))
+    stores = at(read_policy(policy).config, "collect.more", None)
+    if isinstance(stores, list) and stores and experiment.collect.more is None:
+        names = ",".join(map(str, stores))
         raise UserError(
             f"{policy} was also trained on {names}: add collect.more=[{names}] to train on "
             "these episodes again, or collect.more=[] to leave them out"
@@ -121,52 +121,52 @@ def _require_further_episodes(experiment: Experiment, policy: Path) -> None:
 
 def require_new(seeds: range, store: EpisodeStore) -> None:
     """Raise a UserError if a demonstration has one of the seeds."""
-    seen = [entry.seed for entry in store.tried if entry.seed in seeds]
-    if seen:
+    used_seeds = [entry.seed for entry in store.tried if entry.seed in seeds]
+    if used_seeds:
         raise UserError(
             f"improve.seed={seeds.start}: the {len(seeds)} seeds of the rounds must be new, and the demonstrations in "
-            f"{store.folder} have {listed(seen)}: set improve.seed={max(seen) + 1}, or higher"
+            f"{store.folder} have {listed(used_seeds)}: set improve.seed={max(used_seeds) + 1}, or higher"
         )
 
 
-def _labelled(experiment: Experiment, checkpoint: Path, folder: Path, seed: int) -> EpisodeStore:
+def _labelled_store(experiment: Experiment, checkpoint: Path, folder: Path, seed: int) -> EpisodeStore:
     """Return the store of a round: episodes of the policy in a checkpoint, labelled by the expert; add missing ones."""
-    asked = experiment.options(Rounds)
-    task = with_changes(experiment["task"], asked.changes)
-    environment = experiment.make_environment(asked.changes)
-    own = {
+    options = experiment.options(Rounds)
+    task = with_changes(experiment["task"], options.changes)
+    environment = experiment.make_environment(options.changes)
+    nodes = {
         "task": task,
         "expert": experiment["expert"],
         "policy": {**experiment["policy"], "weights": read_policy(checkpoint).training.weights[:12]},
-        "improve": {"episodes": asked.episodes, "seed": seed},
+        "improve": {"episodes": options.episodes, "seed": seed},
     }
     world = environment()
     world.close()
-    store = EpisodeStore.create_or_open(folder, world.spec, own, experiment.collect.codec)
+    store = EpisodeStore.create_or_open(folder, world.spec, nodes, experiment.collect.codec)
     with policy_for_workers(experiment, checkpoint) as policy:
         assert policy is not None, "there is a checkpoint"
         agent = partial(make_supervised, policy, experiment.make_expert())
-        collect(store, environment, agent, asked.episodes, experiment.cluster(), seed, keep_failures=True)
+        collect(store, environment, agent, options.episodes, experiment.cluster(), seed, keep_failures=True)
     return EpisodeStore(folder)
 
 
 def _round(experiment: Experiment, checkpoint: Path, folder: Path, stores: Sequence[Path]) -> Experiment:
     """Return the experiment that trains in a round, from the last weights, on demonstrations and all rounds so far."""
     steps, batches = experiment.options(Rounds).steps, experiment["trainer"]["accumulate_grad_batches"]
-    more = [*(experiment.collect.more or ()), *map(str, stores)]
+    store_folders = [*(experiment.collect.more or ()), *map(str, stores)]
     return experiment.with_values(
         {
             "job": "train",
             "output": str(folder),
             "pretrained": str(checkpoint),
-            "collect.more": more,
+            "collect.more": store_folders,
             "trainer.max_steps": steps,
             "trainer.val_check_interval": steps * batches,  # once, at the end
         }
     )
 
 
-def _trained(experiment: Experiment) -> Path:
+def _train(experiment: Experiment) -> Path:
     checkpoint = train(experiment)
     assert checkpoint is not None, "this is the only process"
     return checkpoint

@@ -26,14 +26,14 @@ log = logging.getLogger(__name__)
 
 def run(experiment: Experiment) -> None:
     """Verify and describe a store, after merging or repairing if asked for, or replay one episode."""
-    wanted = experiment.options(Inspection)
-    if wanted.episode is None:
-        inspect_store(wanted)
+    options = experiment.options(Inspection)
+    if options.episode is None:
+        inspect_store(options)
     else:
-        if others := [name for name in ("stores", "where", "repair", "into") if getattr(wanted, name)]:
-            raise UserError(f"inspect.episode replays an episode of inspect.folder: omit inspect.{others[0]}")
+        if names := [name for name in ("stores", "where", "repair", "into") if getattr(options, name)]:
+            raise UserError(f"inspect.episode replays an episode of inspect.folder: omit inspect.{names[0]}")
         robot, recorded = experiment["task"].get("robot"), experiment["recorder"] is not None
-        replay_episode(experiment.output, Path(wanted.folder), wanted.episode, robot, recorded)
+        replay_episode(experiment.output, Path(options.folder), options.episode, robot, recorded)
 
 
 def inspect_store(wanted: Inspection) -> None:
@@ -41,7 +41,7 @@ def inspect_store(wanted: Inspection) -> None:
 
     Raises a UserError if the store cannot be read or made, or, after its intact episodes are described, is damaged.
     """
-    findings = verify_store(EpisodeStore(_chosen(wanted), damaged=True))
+    findings = verify_store(EpisodeStore(_store_folder(wanted), damaged=True))
     show(store_table(findings))
     if findings.whole:
         with warn_on_error(findings.store.folder / "card.md"):  # a store may be read-only
@@ -49,24 +49,24 @@ def inspect_store(wanted: Inspection) -> None:
     require_whole(findings)
 
 
-def _chosen(wanted: Inspection) -> Path:
+def _store_folder(options: Inspection) -> Path:
     """Return the path of the store to inspect; make it if needed."""
-    folder = Path(wanted.folder)
-    if wanted.into is None:
-        if wanted.stores or wanted.where:
+    folder = Path(options.folder)
+    if options.into is None:
+        if options.stores or options.where:
             raise UserError("inspect.stores and inspect.where make a new store: give its folder, inspect.into=DIR")
-        if not wanted.repair:
+        if not options.repair:
             return folder
         if not verify_store(EpisodeStore(folder, damaged=True)).damaged:
             log.info("nothing in %s is damaged, so nothing is repaired", folder)
             return folder
-    sources = [EpisodeStore(source, damaged=wanted.repair) for source in wanted.stores or [folder]]
-    new = Path(wanted.into or f"{folder}-repaired")
-    damaged = derive_store(sources, new, wanted.where, wanted.repair)
-    log.info("wrote %s; its sources are unchanged", new)
+    sources = [EpisodeStore(source, damaged=options.repair) for source in options.stores or [folder]]
+    target = Path(options.into or f"{folder}-repaired")
+    damaged = derive_store(sources, target, options.where, options.repair)
+    log.info("wrote %s; its sources are unchanged", target)
     if damaged:
         log.warning("counted as failed from now on: %s, %s", counted(len(damaged), "damaged seed"), listed(damaged))
-    return new
+    return target
 
 
 def replay_episode(
@@ -93,11 +93,11 @@ def replay_episode(
     require_no_paths(config, ("task",), folder, ["task.robot"] if robot else [])
     environment = make_environment(config["task"])
     store.spec.require(environment.spec, f"the episode store {folder}", "its task as it is built now")
-    recorder, written = None, ""
+    recorder, file_name = None, ""
     if recorded:
         from vla.rollouts.recorder import RerunRecorder  # imports the viewer's library
 
-        recorder, written = RerunRecorder(output, pictures=0), f"{recording_name(seed, episode.outcome)}.rrd"
+        recorder, file_name = RerunRecorder(output, pictures=0), f"{recording_name(seed, episode.outcome)}.rrd"
     with environment.blind():
         step = replay(environment, episode, recorder).differs
     environment.close()
@@ -105,7 +105,7 @@ def replay_episode(
         log.info("the replay goes through the same states, bit for bit, and ends in %s", episode.outcome)
     else:
         log.warning("the replay differs from step %d on: a recording shows its scene, all else is from the store", step)
-    if written:
+    if file_name:
         recording = output / f"episode-{seed}.rrd"
-        os.replace(output / written, recording)
+        os.replace(output / file_name, recording)
         log.info("wrote %s", recording)

@@ -51,11 +51,11 @@ def require_compiler(config: Mapping[str, Any], groups: Container[str]) -> None:
 
     On a CPU PyTorch calls a C++ compiler, on a GPU Triton calls a C compiler, which the packages of the former include.
     """
-    known = [os.environ["CXX"]] if "CXX" in os.environ else ["g++", "clang++"]
+    compilers = [os.environ["CXX"]] if "CXX" in os.environ else ["g++", "clang++"]
     for name in ("learner", "policy"):
         compiles = name in groups and (config[name] or {}).get("compile") is True
-        if compiles and not any(shutil.which(shlex.split(each)[0]) for each in known if each.strip()):
+        if compiles and not any(shutil.which(shlex.split(command)[0]) for command in compilers if command.strip()):
             raise UserError(
-                f"{name}.compile needs a C++ compiler, and there is no {' or '.join(known)}: install g++ and "
+                f"{name}.compile needs a C++ compiler, and there is no {' or '.join(compilers)}: install g++ and "
                 f"python3-dev, or set {name}.compile=false"
             )

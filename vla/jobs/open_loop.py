@@ -40,9 +40,9 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     """
     output, folder = experiment.output, Path(experiment.collect.folder)
     facts: dict[str, Any] = {**experiment.settings.chosen, "origin": asdict(experiment.origin)}
-    fraction = _held_out(experiment, checkpoint)  # before an import
-    known = checkpoint is not None and is_store(folder)  # else an earlier import is compared with its dataset
-    store = EpisodeStore(folder, experiment.collect.episodes) if known else demonstrations(experiment)
+    fraction = _held_out_fraction(experiment, checkpoint)  # before an import
+    has_store = checkpoint is not None and is_store(folder)  # else an earlier import is compared with its dataset
+    store = EpisodeStore(folder, experiment.collect.episodes) if has_store else demonstrations(experiment)
     if checkpoint is None:
         make_agent: Any = experiment.make_agent()
         policy = make_agent(experiment.world())
@@ -72,24 +72,24 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     return -result.relative
 
 
-def _held_out(experiment: Experiment, checkpoint: Path | None) -> float:
+def _held_out_fraction(experiment: Experiment, checkpoint: Path | None) -> float:
     """Return the share of episodes that training holds out, or held out; raise a UserError if there are none."""
-    fraction, whose = experiment["data"]["validation_fraction"], "a training would be"
+    fraction, subject = experiment["data"]["validation_fraction"], "a training would be"
     if checkpoint is not None:
-        saved, whose = read_policy(checkpoint), f"{checkpoint} was trained"
+        policy, subject = read_policy(checkpoint), f"{checkpoint} was trained"
         world = experiment.world().spec
-        saved.spec.require_input(world, f"the checkpoint {checkpoint}", "the task, with the options given here,")
+        policy.spec.require_input(world, f"the checkpoint {checkpoint}", "the task, with the options given here,")
         # Else `_require_trained_on` would find other images, after an import.
-        size, asked = (at(config, "task.image_size") for config in (saved.config, experiment.config))
-        if size != asked:
+        size, value = (at(config, "task.image_size") for config in (policy.config, experiment.config))
+        if size != value:
             raise UserError(
-                f"{checkpoint} was trained with task.image_size={str(size)[:50]}, not {asked}, and only images of that "
+                f"{checkpoint} was trained with task.image_size={str(size)[:50]}, not {value}, and only images of that "
                 "size tell which episodes were held out: set it as in training"
             )
-        fraction = at(saved.config, "data.validation_fraction", None)
+        fraction = at(policy.config, "data.validation_fraction", None)
     if not isinstance(fraction, float | int) or not fraction:
         raise UserError(
-            f"data.validation_fraction={fraction}: {whose} on all episodes, and errors on these say nothing about "
+            f"data.validation_fraction={fraction}: {subject} on all episodes, and errors on these say nothing about "
             "others: train with a larger fraction"
         )
     return fraction
@@ -97,15 +97,15 @@ def _held_out(experiment: Experiment, checkpoint: Path | None) -> float:
 
 def _require_trained_on(store: EpisodeStore, more: Sequence[str], checkpoint: Path) -> None:
     """Raise a UserError unless a checkpoint was trained on the episodes of a store, and of `more` stores."""
-    saved, entries = read_policy(checkpoint), store.episodes
-    further = [entry for folder in more for entry in EpisodeStore(folder).episodes]
-    if saved.training.windows != digest_of([*entries, *further]):
+    policy, entries = read_policy(checkpoint), store.episodes
+    more_entries = [entry for folder in more for entry in EpisodeStore(folder).episodes]
+    if policy.training.windows != digest_of([*entries, *more_entries]):
         folders = " and those in ".join(map(str, [store.folder, *more]))
         raise UserError(
             f"{checkpoint} was trained on other episodes than the {len(entries)} in {folders}, so which of them were "
             "held out is unknown: name the recording, its options, collect.episodes and collect.more as in training"
         )
-    if origin := saved.config.get("pretrained"):
+    if origin := policy.config.get("pretrained"):
         log.warning(
             "%s began with the weights of %s: whether these were trained on its episodes is unknown", checkpoint, origin
         )
@@ -124,5 +124,5 @@ def _measure(experiment: Experiment, store: EpisodeStore, fraction: float, polic
         )
     actions = store.rows("action")
     constant = np.concatenate([actions[entry.span] for entry in parts[False]]).mean(0)
-    shown = track(parts[True][: experiment.evaluate.episodes], "evaluating")
-    return open_loop(policy, store.spec, (episode_of(store, entry) for entry in shown), constant)
+    entries = track(parts[True][: experiment.evaluate.episodes], "evaluating")
+    return open_loop(policy, store.spec, (episode_of(store, entry) for entry in entries), constant)

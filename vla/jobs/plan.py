@@ -44,11 +44,11 @@ def plan_table(asked: Power) -> Table:
     fixed = episodes_needed(partial(power_of_samples, one=one, other=other), asked.power)
     rows.append(["two policies, different episodes", *_numbers(fixed, None)])
     difference = abs(other - one)
-    for how, share in _shares(asked, one, other).items():
+    for case, share in _shares(asked, one, other).items():
         fixed = episodes_needed(partial(power_of_pairs, discordant=share, difference=difference), asked.power)
         ones, zeros = (share + difference) / 2, (share - difference) / 2
         stops = stopping(0.5, ones, zeros, asked.power, fixed) if fixed else None
-        rows.append([f"two policies, same episodes, {_percent(share)} differ{how}", *_numbers(fixed, stops)])
+        rows.append([f"two policies, same episodes, {_percent(share)} differ{case}", *_numbers(fixed, stops)])
     heads = ("compared", "episodes", "until=decided: at most", "on average", "false differences")
     return Table(heads, rows, note=NOTE)
 
@@ -60,11 +60,11 @@ def _shares(asked: Power, one: float, other: float) -> dict[str, float]:
     """
     if asked.runs and asked.discordant is not None:
         raise UserError("plan.discordant is measured on plan.runs: omit one of the two")
-    share = _measured(asked.runs) if asked.runs else asked.discordant
+    share = _measured_share(asked.runs) if asked.runs else asked.discordant
     difference, largest = abs(other - one), min(one + other, 2 - one - other)
     if share is None:
-        apart = one * (1 - other) + other * (1 - one)
-        return {" (independent failures)": apart, " (the better never fails alone)": difference}
+        independent = one * (1 - other) + other * (1 - one)
+        return {" (independent failures)": independent, " (the better never fails alone)": difference}
     if difference - 1e-9 <= share <= largest + 1e-9:
         return {"": max(share, difference)}
     raise UserError(
@@ -73,11 +73,11 @@ def _shares(asked: Power, one: float, other: float) -> dict[str, float]:
     )
 
 
-def _measured(folders: tuple[str, str]) -> float:
+def _measured_share(folders: tuple[str, str]) -> float:
     """Return the share of the common episodes of two runs in which only one succeeded."""
     one, other = read_runs([Path(folder) for folder in folders]).values()
-    if common := common_episodes(one, other, IN_DISTRIBUTION):
-        return sum(first.success != second.success for first, second in common) / len(common)
+    if pairs := common_episodes(one, other, IN_DISTRIBUTION):
+        return sum(first.success != second.success for first, second in pairs) / len(pairs)
     raise UserError(
         f"plan.runs={folders} have no episode in common: replace them by plan.discordant=0.05, the share that differs"
     )

@@ -20,8 +20,8 @@ log = logging.getLogger(__name__)
 
 def run(experiment: Experiment) -> None:
     """Roll out the expert on a few seeds; write contact sheet and, with a recorder, recording; print the draws."""
-    output, shown = experiment.output, experiment.options(Preview)
-    seeds, written = range(shown.seed, shown.seed + shown.episodes), [output / "preview.png"]
+    output, options = experiment.output, experiment.options(Preview)
+    seeds, files = range(options.seed, options.seed + options.episodes), [output / "preview.png"]
     with (
         writing(output / "preview.rrd"),
         TemporaryDirectory(prefix=".recordings-", dir=output) as folder,
@@ -29,17 +29,17 @@ def run(experiment: Experiment) -> None:
     ):
         make_recorder = experiment.make_recorder(Path(folder))
         expert, recorder = experiment.make_expert()(environment), make_recorder() if make_recorder else None
-        first, draws = [], []  # of every episode; all of their images might not fit into memory
+        first_observations, draws = [], []  # of every episode; all of their images might not fit into memory
         for seed in seeds:
             episode = rollout(environment, expert, seed, recorder)
-            first.append(episode.observations[0])
+            first_observations.append(episode.observations[0])
             draws.append(episode.draws)
         close_agent(expert)
         if recordings := sorted(Path(folder).glob("*.rrd")):
             from vla.rollouts.recorder import merge  # imports the viewer's library
 
             merge(recordings, output / "preview.rrd")
-            written.append(output / "preview.rrd")
-    save(output / "preview.png", reset_panels(list(seeds), first), 2, (6.5, 2.2))
+            files.append(output / "preview.rrd")
+    save(output / "preview.png", reset_panels(list(seeds), first_observations), 2, (6.5, 2.2))
     show(draws_table(list(seeds), draws))
-    log.info("wrote %s", " and ".join(map(str, written)))
+    log.info("wrote %s", " and ".join(map(str, files)))

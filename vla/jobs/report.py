@@ -22,8 +22,8 @@ def run(experiment: Experiment) -> None:
     for table in difference_tables(compared):
         if table.rows:
             show(table)
-    for remark, about in (found := remarks(runs, compared)).items():
-        log.info("%s: %s", remark, about)
+    for remark, names in (notes := remarks(runs, compared)).items():
+        log.info("%s: %s", remark, names)
     title = f"{len(runs)} runs" if len(runs) > 1 else next(iter(runs))
     page = Path(experiment.settings.output) / COMPARISON
-    log.info("wrote %s", write_comparison(page, title, rows_of(runs), compared, found))
+    log.info("wrote %s", write_comparison(page, title, rows_of(runs), compared, notes))

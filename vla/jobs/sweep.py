@@ -40,8 +40,8 @@ class SweepTable(Callback):
             if job_return.status == JobStatus.COMPLETED:  # from a concurrent sweep in this folder
                 (Path(config.hydra.runtime.output_dir) / FAILURE).unlink(missing_ok=True)
             folder = Path(config.hydra.sweep.dir)
-            ended = len({*cells(folder, REPORT), *cells(folder, FAILURE)})
-            if ended <= EVERY or ended % EVERY == 0:
+            count = len({*cells(folder, REPORT), *cells(folder, FAILURE)})
+            if count <= EVERY or count % EVERY == 0:
                 write_table(folder)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:

@@ -63,18 +63,18 @@ def train(experiment: Experiment) -> Path | None:
     folder has another training, or this one cannot start.
     """
     output = experiment.output
-    last, chosen = training_progress(output, experiment.config)
-    if chosen is not None:
-        return chosen if first_process() else None
-    first = _trained(experiment, last)
+    last, policy = training_progress(output, experiment.config)
+    if policy is not None:
+        return policy if first_process() else None
+    is_first = _run_training(experiment, last)
     gc.collect()  # reference cycles hold trainer and model, whose memory a later training or evaluation needs
-    if not first:
+    if not is_first:
         return None
     log.info("the policy is %s", output / POLICY)
     return output / POLICY
 
 
-def _trained(experiment: Experiment, last: Path | None) -> bool:
+def _run_training(experiment: Experiment, last: Path | None) -> bool:
     """Train, from a `last` checkpoint if there is one; return whether this is the first process."""
     quiet_lightning()
     output = experiment.output
@@ -86,7 +86,7 @@ def _trained(experiment: Experiment, last: Path | None) -> bool:
         # Before collection, so that missing devices are reported early.
         callbacks = [
             Estimate(experiment.config),
-            _Begun(experiment),
+            _TrainingStart(experiment),
             *([closed_loop] if closed_loop else []),
             graceful_stop,
         ]
@@ -118,7 +118,7 @@ def warn_of_length(experiment: Experiment) -> None:
 
 def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_stop: GracefulStop) -> None:
     """Collect missing demonstrations, train on them, from a `last` checkpoint if there is one, and write the policy."""
-    more = [EpisodeStore(folder) for folder in experiment.collect.more or ()]
+    extra_stores = [EpisodeStore(folder) for folder in experiment.collect.more or ()]
     output, origin = experiment.output, None if last else experiment.pretrained
     lightning.seed_everything(experiment.settings.seed, verbose=False)
     with explain_memory_errors(experiment.config), graceful_stop.explaining_restore(last):
@@ -127,17 +127,17 @@ def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_s
     store, model = demonstrations(experiment), learner.model
     if origin is last is None:
         experiment.fit_tokenizer(model.tokenizer, store)
-        if random := [part for part in experiment["learner"]["frozen"] if not is_within(part, trunks(model))]:
-            log.warning("learner.frozen=[%s]: what is not pretrained there stays random", ", ".join(random))
+        if parts := [part for part in experiment["learner"]["frozen"] if not is_within(part, trunks(model))]:
+            log.warning("learner.frozen=[%s]: what is not pretrained there stays random", ", ".join(parts))
     if last is None:
         model.fit(store.numbers("state"), store.numbers("action"))
-    _warn_of_tokenization(model, [store, *(each for each in more if each.episodes)])
+    _warn_of_tokenization(model, [store, *(extra for extra in extra_stores if extra.episodes)])
     data = _windows(experiment, store, model, trainer)
     if last:
         restore_metrics(trainer, last)
     else:
         save_config(output, experiment.config, experiment.changes)  # also of a training that fails at its start
-    with writing(output), _reported(experiment, trainer, graceful_stop, learner, last is not None):
+    with writing(output), _saving_result(experiment, trainer, graceful_stop, learner, last is not None):
         try:
             with (
                 explain_memory_errors(experiment.config),
@@ -177,16 +177,16 @@ def _windows(experiment: Experiment, store: EpisodeStore, model: Model, trainer:
 def _save(trainer: Trainer, output: Path) -> None:
     """Save the policy, or a better earlier one, then the checkpoint, whose `finished` says that the policy exists."""
     callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-    (better,) = [each.clearly_better() for each in callbacks if isinstance(each, ClosedLoop)] or [None]
-    if better is None:
+    (folder,) = [callback.clearly_better() for callback in callbacks if isinstance(callback, ClosedLoop)] or [None]
+    if folder is None:
         trainer.save_checkpoint(output / POLICY, weights_only=False)
     elif trainer.is_global_zero:
         with atomic_path(output / POLICY) as draft:
-            shutil.copytree(better, draft)
+            shutil.copytree(folder, draft)
     trainer.save_checkpoint(output / CHECKPOINTS / LAST, weights_only=False)
 
 
-class _Begun(Callback):
+class _TrainingStart(Callback):
     """Archives an earlier evaluation in the run's folder, and saves the config, once training starts or continues."""
 
     def __init__(self, experiment: Experiment) -> None:
@@ -205,15 +205,15 @@ def _warn_of_tokenization(model: Model, stores: list[EpisodeStore]) -> None:
     for store in stores:
         chunks = store.statistics.chunks(model.chunk)
         if model.uses_tokens and store is stores[0]:
-            component, lost = rounding(model.tokenizer, chunks, store.spec)
-            if lost > COARSE:
-                finer = "tokenizer=uniform and more tokenizer.bins are finer"
+            component, loss = rounding(model.tokenizer, chunks, store.spec)
+            if loss > COARSE:
+                advice = "tokenizer=uniform and more tokenizer.bins are finer"
                 text = "as tokens, the demonstrated actions lose %.1f %% of the range of %s on average: %s"
-                log.warning(text, 100 * lost, component, finer)
+                log.warning(text, 100 * loss, component, advice)
         clips = model.uses_tokens or isinstance(model, Diffusion)
-        if clips and (outside := out_of_bounds(model.tokenizer, chunks)):
-            where = f"{100 * outside:.2g} % of the demonstrated actions in {store.folder}"
-            log.warning("%s exceed the bounds of the tokenizer, to which they are clipped", where)
+        if clips and (share := out_of_bounds(model.tokenizer, chunks)):
+            subject = f"{100 * share:.2g} % of the demonstrated actions in {store.folder}"
+            log.warning("%s exceed the bounds of the tokenizer, to which they are clipped", subject)
 
 
 def _closed_loop(experiment: Experiment) -> ClosedLoop | None:
@@ -230,12 +230,12 @@ def _closed_loop(experiment: Experiment) -> ClosedLoop | None:
 
 
 @contextmanager
-def _reported(
+def _saving_result(
     experiment: Experiment, trainer: Trainer, graceful_stop: GracefulStop, learner: Learner, resumed: bool
 ) -> Iterator[None]:
     """Save result and page of a training however it ends; a resumed one keeps the origins of its earlier parts."""
-    output, before, ended = experiment.output, read_training(experiment.output), "done"
-    origins = before.origins if before and resumed else []
+    output, training, end = experiment.output, read_training(experiment.output), "done"
+    origins = training.origins if training and resumed else []
     origins = origins if experiment.origin in origins else [*origins, experiment.origin]  # of its beginning, and later
     parameters = sum(parameter.numel() for parameter in learner.model.parameters())
     start = f", starting from {origin}" if (origin := experiment.settings.pretrained) else ""
@@ -243,13 +243,13 @@ def _reported(
     try:
         yield
     except BaseException as error:
-        ended = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
+        end = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
         raise
     finally:
         # A training that cannot be resumed stays as it was; one interrupted after its last step has nothing left to do.
-        if trainer.is_global_zero and (graceful_stop.started or before is None or ended == "done" != before.ended):
+        if trainer.is_global_zero and (graceful_stop.started or training is None or end == "done" != training.ended):
             size = parameters, trainer.global_step, round(graceful_stop.seconds, 1)
-            save_training(output, Training(*size, ended, origins))
+            save_training(output, Training(*size, end, origins))
             with warn_on_error(output / PAGE):
                 write_page(output)
         end_wandb()

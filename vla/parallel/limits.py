@@ -44,12 +44,12 @@ def free_memory() -> int:
 
 def scarce_memory(share: float) -> bool:
     """Return whether less than a share of the memory is free, of the machine or of a control group."""
-    return any(free < share * most for most, free in _limits())
+    return any(free < share * total for total, free in _limits())
 
 
 def memory() -> int:
     """Return the memory [bytes] of the machine, or of the control group that has the least."""
-    return min(most for most, _ in _limits())
+    return min(total for total, _ in _limits())
 
 
 def _limits() -> Iterator[tuple[int, int]]:
@@ -57,7 +57,7 @@ def _limits() -> Iterator[tuple[int, int]]:
     machine = psutil.virtual_memory()
     yield machine.total, machine.available
     for group in _groups():
-        yield from _of(group)
+        yield from _group_limit(group)
 
 
 def _groups() -> Iterator[Path]:
@@ -78,13 +78,13 @@ def _number(file: Path) -> int | None:
         return None
 
 
-def _of(group: Path) -> Iterator[tuple[int, int]]:
+def _group_limit(group: Path) -> Iterator[tuple[int, int]]:
     """Yield the whole memory and the free part of it [bytes] of a control group if it is limited."""
     for limit, used, droppable in MEMORY_FILES:
-        most, now = _number(group / limit), _number(group / used)
+        total, usage = _number(group / limit), _number(group / used)
         try:
-            held = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+            statistics = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
         except (OSError, ValueError):
-            held = {}
-        if most and now is not None:
-            yield most, max(0, most - now + int(held.get(droppable, 0)))
+            statistics = {}
+        if total and usage is not None:
+            yield total, max(0, total - usage + int(statistics.get(droppable, 0)))

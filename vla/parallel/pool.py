@@ -103,7 +103,7 @@ class ProcessPool:
         self._lock = threading.Lock()
         self._processes: list[WorkerProcess] = []
         self._closed = False
-        self._own, self._numbers = threading.local(), itertools.count()
+        self._local, self._numbers = threading.local(), itertools.count()
         self._threads = futures.ThreadPoolExecutor(size, initializer=self._enter_thread)
 
     def submit(self, item: Any) -> futures.Future[Any]:
@@ -142,7 +142,7 @@ class ProcessPool:
         # Processes inherit the signal mask of the thread that starts them; starting the tracker would reset it.
         resource_tracker.ensure_running()
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        self._own.process, self._own.number = None, next(self._numbers)
+        self._local.process, self._local.number = None, next(self._numbers)
 
     def _attempt(self, item: Any) -> Any:
         try:
@@ -161,7 +161,7 @@ class ProcessPool:
         try:
             return process.ask(item)
         except ProcessEnded:
-            self._own.process = None
+            self._local.process = None
             self._forget(process)
             raise
 
@@ -174,11 +174,11 @@ class ProcessPool:
 
     def _process(self) -> WorkerProcess:
         """Return the process of this thread, started and with its worker created."""
-        if self._own.process is None:
+        if self._local.process is None:
             with self._lock:
                 if self._closed:
                     raise WorkersLost("the pool is closed")
-                process = WorkerProcess(self._make, self._own.number)
+                process = WorkerProcess(self._make, self._local.number)
                 self._processes.append(process)
             try:
                 process.answer()
@@ -190,8 +190,8 @@ class ProcessPool:
                 raise UserError(
                     f"a worker process could not start: {end}, see its output, or run with cluster.workers=1"
                 ) from end
-            self._own.process = process
-        return self._own.process
+            self._local.process = process
+        return self._local.process
 
 
 Pool = _SerialPool | ProcessPool

@@ -47,11 +47,11 @@ class WorkerProcess:
     """Spawned process that sends one answer when its worker exists, and then one per item."""
 
     def __init__(self, make: bytes, number: int) -> None:
-        self._connection, there = get_context("spawn").Pipe()
+        self._connection, child_end = get_context("spawn").Pipe()
         # A daemon ends with this process, even if the context of its pool is never left.
-        self._process = get_context("spawn").Process(target=_serve, args=(there, make, number), daemon=True)
+        self._process = get_context("spawn").Process(target=_serve, args=(child_end, make, number), daemon=True)
         self._process.start()
-        there.close()  # so that the end of the process ends the connection
+        child_end.close()  # so that the end of the process ends the connection
 
     @property
     def killed(self) -> bool:
@@ -63,7 +63,7 @@ class WorkerProcess:
         try:
             self._connection.send(item)
         except OSError as error:
-            raise ProcessEnded(self._how_it_ended()) from error
+            raise ProcessEnded(self._exit_reason()) from error
         return self.answer()
 
     def answer(self) -> Any:
@@ -71,12 +71,12 @@ class WorkerProcess:
         try:
             result, error = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError) as end:
-            raise ProcessEnded(self._how_it_ended()) from end
+            raise ProcessEnded(self._exit_reason()) from end
         if error is not None:
             raise error
         return result
 
-    def _how_it_ended(self) -> str:
+    def _exit_reason(self) -> str:
         self._process.join()
         code = self._process.exitcode or 0
         if code >= 0:
@@ -107,10 +107,10 @@ def _serve(connection: Connection, make: bytes, number: int) -> None:
     """Create a worker and process items until the connection is closed."""
     os.environ[WORKER] = str(number)
     leave_with_parent()
-    made: list[Worker] = []
+    workers: list[Worker] = []
     # Unpickled here, not as an argument of the process, so that import errors reach the parent.
-    connection.send_bytes(_outcome(lambda: made.append(pickle.loads(make)())))
-    for worker in made:
+    connection.send_bytes(_outcome(lambda: workers.append(pickle.loads(make)())))
+    for worker in workers:
         with closing(worker):
             while True:
                 try:
@@ -125,9 +125,9 @@ def _outcome(function: Callable[..., Any], *arguments: Any) -> bytes:
     try:
         return pickle.dumps((function(*arguments), None))
     except Exception as error:  # any error, also of pickling: the parent raises it
-        told = portable(error)
-        told.add_note(f"\nIn the worker process:\n{traceback.format_exc()}")
-        return pickle.dumps((None, told))
+        portable_error = portable(error)
+        portable_error.add_note(f"\nIn the worker process:\n{traceback.format_exc()}")
+        return pickle.dumps((None, portable_error))
 
 
 def portable(error: BaseException) -> BaseException:
@@ -172,12 +172,12 @@ def spin_briefly() -> None:
 @contextmanager
 def stopped_by(*signals: signal.Signals) -> Iterator[threading.Event]:
     """Yield an event that these signals set within the context."""
-    stopped = threading.Event()
-    before = {number: signal.signal(number, lambda *_: stopped.set()) for number in signals}
+    event = threading.Event()
+    handlers = {number: signal.signal(number, lambda *_: event.set()) for number in signals}
     try:
-        yield stopped
+        yield event
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
 
 
@@ -199,7 +199,7 @@ def one_thread_each() -> Iterator[None]:
 
     Sums must not depend on the number of workers on the machine.
     """
-    before = {name: os.environ.get(name) for name in THREAD_SETTINGS}
+    old_values = {name: os.environ.get(name) for name in THREAD_SETTINGS}
     torch = sys.modules.get("torch")  # already loaded if this process trained the policy
     threads = torch.get_num_threads() if torch else 0
     os.environ.update(THREAD_SETTINGS)  # read when a library is loaded
@@ -210,7 +210,7 @@ def one_thread_each() -> Iterator[None]:
     finally:
         if torch:
             torch.set_num_threads(threads)
-        for name, value in before.items():
+        for name, value in old_values.items():
             if value is None:
                 del os.environ[name]
             else:

@@ -50,15 +50,15 @@ def compare(pairs: Iterable[tuple[SweepRow, SweepRow]], margin: float) -> Compar
     training condition are left out. Verdicts take all comparisons into account, those on secondary metrics separately;
     `margin`, 0…1, is how much less success counts as not worse.
     """
-    found: dict[tuple[str, ...], dict[str, Comparison]] = {
-        (other.name, one.name, condition): compared
+    comparisons: dict[tuple[str, ...], dict[str, Comparison]] = {
+        (other.name, one.name, condition): metrics
         for one, other in pairs
         for condition in one.played
         if condition in other.played
         and not _repeats_training_condition((*one.runs, *other.runs), condition)
-        and (compared := _compared(one, other, condition))
+        and (metrics := _compare_rows(one, other, condition))
     }
-    return concluded(found, margin)
+    return concluded(comparisons, margin)
 
 
 def _repeats_training_condition(runs: Sequence[Run], condition: str) -> bool:
@@ -67,7 +67,7 @@ def _repeats_training_condition(runs: Sequence[Run], condition: str) -> bool:
     return all(changes is not None and with_changes(task, changes) == task for task, changes in tasks)
 
 
-def _compared(one: SweepRow, other: SweepRow, condition: str) -> dict[str, Comparison]:
+def _compare_rows(one: SweepRow, other: SweepRow, condition: str) -> dict[str, Comparison]:
     """Compare two rows under a condition, see `compare`; empty if worlds differ, or samples stopped early."""
     runs = one.runs[0], other.runs[0]
     reports = [run.reports[condition] for row in (one, other) for run in row.runs if condition in run.reports]
@@ -75,8 +75,8 @@ def _compared(one: SweepRow, other: SweepRow, condition: str) -> dict[str, Compa
     if len(one.runs) == len(other.runs) == 1 and (together := common_episodes(*runs, condition)):
         return compared_in(together, anytime)
     first, second = (_by_seed(run, condition) for run in runs)
-    if shared := first.keys() & second.keys():  # then each of them must be of the same world in both samples
-        same_world = all(first[seed][1] == second[seed][1] for seed in shared)
+    if common_seeds := first.keys() & second.keys():  # then each of them must be of the same world in both samples
+        same_world = all(first[seed][1] == second[seed][1] for seed in common_seeds)
     else:
         same_world = _scenes(runs[0], condition) == _scenes(runs[1], condition)
     if anytime or not (first and second and same_world):
@@ -88,39 +88,39 @@ def _compared(one: SweepRow, other: SweepRow, condition: str) -> dict[str, Compa
 
 def remarks(runs: Mapping[str, Run], compared: Compared | None = None) -> dict[str, str]:
     """Return remark → the names of the runs that it concerns; given comparisons, also the pairs that have none."""
-    known = {(one, other) for other, one, _ in compared or ()}
-    pairs = [] if compared is None else [pair for pair in combinations(runs, 2) if pair not in known]
+    compared_pairs = {(one, other) for other, one, _ in compared or ()}
+    pairs = [] if compared is None else [pair for pair in combinations(runs, 2) if pair not in compared_pairs]
     versions: dict[str, dict[str, None]] = {}  # library → its versions, in order and without repetition
     for run in runs.values():
         for library, version in run.report.versions.items() if run.report else ():
             versions.setdefault(library, {})[version] = None
-    failed = [
+    failures = [
         f"{len(report.errors)} of {len(report.results)} in {name} ({condition})"
         for name, run in runs.items()
         for condition, report in run.reports.items()
         if report.errors
     ]
-    about = {
+    names_by_remark = {
         "not compared, because no episode is the same in both": [f"{one} and {other}" for one, other in pairs],
         "evaluated with different versions": [f"{n} {' and '.join(v)}" for n, v in versions.items() if len(v) > 1],
-        "episodes that ended in errors, which count nowhere": failed,
+        "episodes that ended in errors, which count nowhere": failures,
     }
-    return {remark: ", ".join(names) for remark, names in about.items() if names}
+    return {remark: ", ".join(names) for remark, names in names_by_remark.items() if names}
 
 
 def difference_tables(compared: Compared) -> list[Table]:
     """Tabulate comparisons of success, and those of milestones and motion."""
-    alone, rows = ("only the first succeeds", "only the second succeeds"), []
+    details, rows = ("only the first succeeds", "only the second succeeds"), []
     for case, metrics in compared.items():
-        found = metrics[SUCCESS]
-        counts = ["" if count is None else str(count) for count in (found.only_first, found.only_second)]
-        rows.append([*case, str(found.episodes), *counts, *difference(found)])
+        comparison = metrics[SUCCESS]
+        counts = ["" if count is None else str(count) for count in (comparison.only_first, comparison.only_second)]
+        rows.append([*case, str(comparison.episodes), *counts, *difference(comparison)])
     note = (
         "Rows with numbers of episodes in which only one succeeds compare the episodes that both played; other rows "
         "compare different episodes of the same world, or several trainings."
     )
-    heads = (*CASE, "episodes", *alone, *DIFFERENCE)
-    return [Table(heads, rows, "Differences in success", note, (*alone, "p")), secondary_table(compared, CASE)]
+    heads = (*CASE, "episodes", *details, *DIFFERENCE)
+    return [Table(heads, rows, "Differences in success", note, (*details, "p")), secondary_table(compared, CASE)]
 
 
 def common_episodes(one: Run, other: Run, condition: str) -> list[tuple[Result, Result]]:
@@ -144,8 +144,8 @@ def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
     """Return the config values that determine the scenes: the task with the changes of a condition, and its network."""
     config, changes = run.report.config if run.report else {}, _changes(run, condition)
     task = at(config, "task")
-    changed = with_changes(task, changes) if changes and isinstance(task, dict) else task
-    return changed, changes is None, at(config, "evaluate.networks", {}).get(condition)
+    world = with_changes(task, changes) if changes and isinstance(task, dict) else task
+    return world, changes is None, at(config, "evaluate.networks", {}).get(condition)
 
 
 def _changes(run: Run, condition: str) -> dict[str, Any] | None:

@@ -39,15 +39,15 @@ def write_comparison(
     for row in rows:
         single = len(row.runs) == 1
         cells += [(row.name if single else run.folder.name, legend[row.name], run) for run in row.runs]
-    few = {name: run for name, _, run in cells} if len(cells) <= len(COLOURS) else {}
+    shown_runs = {name: run for name, _, run in cells} if len(cells) <= len(COLOURS) else {}
     parts = [
         results_table(rows, page.parent),
         Section("Remarks", facts=facts),
         Section("Success", panels=svgs(success_panels(rows)), lines=legend),
         *difference_tables(compared),
         *training_sections([(colour, run.metrics) for _, colour, run in cells]),
-        _config_differences(few),
-        *(_failures(name, run) for name, run in few.items()),
+        _config_differences(shown_runs),
+        *(_failures(name, run) for name, run in shown_runs.items()),
     ]
     return render(page, title, parts, any(report.anytime for _, _, run in cells for report in run.reports.values()))
 
@@ -58,14 +58,14 @@ def tabulate(folder: Path) -> list[SweepRow]:
     if rows:
         margin = at(rows[0].runs[0].config, "evaluate.margin", 0.0)
         compared = compare(((rows[0], other) for other in rows[1:]), margin)
-        failed = failures(folder)
+        failure_lines = failures(folder)
         tables = [results_table(rows), *(difference_tables(compared)[:1] if compared else [])]
-        texts = [*(table.markdown() for table in tables), "".join(f"- failed: {line}\n" for line in failed)]
+        texts = [*(table.markdown() for table in tables), "".join(f"- failed: {line}\n" for line in failure_lines)]
         write_text(folder / "sweep.md", "\n".join(filter(None, texts)))
         size = 4, max(2.5, 0.5 + 0.25 * len(rows))
         save(folder / "sweep.png", success_panels(rows), 4, size, "success, 95 % CI")
         with warn_on_error(folder / SWEEP):
-            facts = {f"failed cell {number}": line for number, line in enumerate(failed, 1)}
+            facts = {f"failed cell {number}": line for number, line in enumerate(failure_lines, 1)}
             facts |= remarks({run.folder.name: run for row in rows for run in row.runs})
             write_comparison(folder / SWEEP, f"Sweep {folder.resolve().name}", rows, compared, facts)
     return rows
@@ -77,7 +77,7 @@ def results_table(rows: Sequence[SweepRow], folder: Path | None = None) -> Table
     costs = [*(["each seed [%]"] if seeds else []), "parameters [M]", "action [ms]", "steps", "training"]
     lines = []
     for row in rows:
-        rates = [rate(row.interval(each)) if each in row.played else ABSENT for each in conditions]
+        rates = [rate(row.interval(condition)) if condition in row.played else ABSENT for condition in conditions]
         lines.append([*row.choices.values(), *rates, *_costs(row, seeds), *([_links(row, folder)] if folder else [])])
     heads = [*rows[0].choices, *(f"{name} [%]" for name in conditions), *costs, *(["pages"] if folder else [])]
     details = [f"{name} [%]" for name in conditions[1:]] if len(conditions) > CONDITIONS else []
@@ -86,13 +86,13 @@ def results_table(rows: Sequence[SweepRow], folder: Path | None = None) -> Table
 
 def _costs(row: SweepRow, seeds: bool) -> list[str]:
     run, training = row.runs[0], row.runs[0].training
-    latencies = [each.report.latency_ms for each in row.runs if each.report and each.report.latency_ms]
-    logged = max((steps[-1] + 1 for steps, _ in run.metrics.values()), default=ABSENT)
+    latencies = [cell.report.latency_ms for cell in row.runs if cell.report and cell.report.latency_ms]
+    last_step = max((steps[-1] + 1 for steps, _ in run.metrics.values()), default=ABSENT)
     return [
         *([", ".join(map(percent, row.rates))] if seeds else []),
         f"{run.parameters / 1e6:.2f}" if run.parameters else ABSENT,
         f"{min(latencies):.1f}" if latencies else ABSENT,  # because other load on the machine only increases it
-        str(training.steps if training else logged),
+        str(training.steps if training else last_step),
         duration(training.seconds) if training else ABSENT,
     ]
 
@@ -105,7 +105,7 @@ def _links(row: SweepRow, folder: Path) -> Markup:
 def success_panels(rows: Sequence[SweepRow]) -> Panels:
     """Return a panel per condition: success of every row, or over the number of demonstrations if that varies."""
     if DEMONSTRATIONS in rows[0].choices:
-        return {each: partial(_plot_demonstrations, rows=rows, condition=each) for each in conditions_of(list(rows))}
+        return {name: partial(_plot_demonstrations, rows=rows, condition=name) for name in conditions_of(list(rows))}
     panels: Panels = {}
     for condition in conditions_of(list(rows)):
         rates = {row.name: row.interval(condition) for row in rows if condition in row.played}
@@ -123,8 +123,8 @@ def _plot_demonstrations(axes: Axes, rows: Sequence[SweepRow], condition: str) -
     lines: dict[str, list[SweepRow]] = {}
     for row in sorted(rows, key=_demonstrations):
         if condition in row.played:
-            others = [value for key, value in row.choices.items() if key != DEMONSTRATIONS]
-            lines.setdefault(" ".join(others), []).append(row)
+            choices = [value for key, value in row.choices.items() if key != DEMONSTRATIONS]
+            lines.setdefault(" ".join(choices), []).append(row)
     for (name, line), colour in zip(lines.items(), cycle(COLOURS), strict=False):
         rates, reach = error_bars(row.interval(condition) for row in line)
         axes.errorbar([*map(_demonstrations, line)], rates, reach, fmt="o-", color=colour, capsize=3, label=name)
@@ -143,8 +143,8 @@ def _demonstrations(row: SweepRow) -> int:
 
 def _config_differences(runs: Mapping[str, Run]) -> Table:
     """Tabulate the dotted keys that differ, with their value in each run."""
-    first, *others = [run.config for run in runs.values()] or [{}]
-    keys = dict.fromkeys(key for other in others for key, _, _ in differences(first, other))
+    config, *configs = [run.config for run in runs.values()] or [{}]
+    keys = dict.fromkeys(key for other in configs for key, _, _ in differences(config, other))
     rows = [[key, *(config_value(at(run.config, key)) for run in runs.values())] for key in keys]
     return Table(["key", *runs], rows, "Differences in configuration")
 
@@ -152,5 +152,5 @@ def _config_differences(runs: Mapping[str, Run]) -> Table:
 def _failures(name: str, run: Run) -> Section:
     results = run.report.per_episode if run.report else []
     pictures = pictured(results, run.folder / RECORDINGS)
-    moving = shown((each for each in results if each.seed in pictures), FAILURES, 0)
-    return Section(f"Failures of {name}", rollouts=[(each, pictures[each.seed]) for each in moving])
+    rollouts = shown((result for result in results if result.seed in pictures), FAILURES, 0)
+    return Section(f"Failures of {name}", rollouts=[(result, pictures[result.seed]) for result in rollouts])

@@ -33,10 +33,10 @@ def store_table(findings: StoreReport) -> Table:
     """Describe a store: its episodes, what they hold, and how large it is."""
     store, spec = findings.store, findings.store.spec
     lengths = [entry.steps for entry in findings.whole] or [0]
-    tried = [entry.seed for entry in store.tried if entry.outcome != NOT_NEEDED]
-    instructions = _most([entry.instruction for entry in findings.whole])
+    seeds = [entry.seed for entry in store.tried if entry.outcome != NOT_NEEDED]
+    instructions = _most_frequent([entry.instruction for entry in findings.whole])
     rows = {
-        "episodes": f"{len(findings.whole)} intact, of {counted(len(tried), 'seed')} tried: {listed(tried)}",
+        "episodes": f"{len(findings.whole)} intact, of {counted(len(seeds), 'seed')} tried: {listed(seeds)}",
         "steps": f"{sum(lengths)}, from {min(lengths)} to {max(lengths)} in an episode",
         "time": f"{60 * findings.hours:.1f} min at {spec.control_hz:g} Hz",
     }
@@ -71,31 +71,31 @@ def _text(findings: StoreReport) -> str:
         f"# {store.folder.name}\n\n![First frames, outcomes, actions and draws](card.png)\n",
         store_table(findings).markdown(),
         Table(("state", "unit"), [*zip(spec.state, spec.state_units, strict=True)]).markdown(),
-        Table(heads, [[name, unit, *(f"{each:.4g}" for each in four)] for name, unit, four in rows]).markdown(),
+        Table(heads, [[name, unit, *(f"{value:.4g}" for value in values)] for name, unit, values in rows]).markdown(),
         Table(("draw", "range"), [*draws]).markdown(),
         *(f"Chosen by `inspect.where={condition}`.\n" for condition in store.config.get("where", ())),
     ]
     for config, entries in entries_by_config(store):
         content = json.dumps(config, indent=1, ensure_ascii=False)
-        tried = [each.seed for each in entries]
-        parts.append(f"{counted(len(tried), 'seed')}, {listed(tried)}:\n\n```json\n{content}\n```\n")
+        seeds = [entry.seed for entry in entries]
+        parts.append(f"{counted(len(seeds), 'seed')}, {listed(seeds)}:\n\n```json\n{content}\n```\n")
     return "\n".join(parts)
 
 
-def _most(values: Sequence[str]) -> dict[str, int]:
+def _most_frequent(values: Sequence[str]) -> dict[str, int]:
     """Return the most frequent values and their counts, with one entry for all others."""
     counts = Counter(values)
-    shown = dict(counts.most_common(WORDS))
-    others = len(counts) - len(shown)
-    return shown if not others else {**shown, f"({counted(others, 'other')})": counts.total() - sum(shown.values())}
+    top = dict(counts.most_common(WORDS))
+    rest = len(counts) - len(top)
+    return top if not rest else {**top, f"({counted(rest, 'other')})": counts.total() - sum(top.values())}
 
 
 def _panels(findings: StoreReport) -> Panels:
     """Return panels of first images, outcomes, lengths, instructions, action labels, and the draws that vary."""
     entries, spec = findings.whole, findings.store.spec
-    shown = [entries[place] for place in sorted({*np.linspace(0, len(entries) - 1, FRAMES).round().astype(int)})]
-    first = [replace(episode_of(findings.store, entry).observations[0], depth={}) for entry in shown]
-    panels = reset_panels([entry.seed for entry in shown], first)
+    sample = [entries[place] for place in sorted({*np.linspace(0, len(entries) - 1, FRAMES).round().astype(int)})]
+    observations = [replace(episode_of(findings.store, entry).observations[0], depth={}) for entry in sample]
+    panels = reset_panels([entry.seed for entry in sample], observations)
     colours = [GREEN if name == "success" else RED for name in findings.outcomes]
     panels["outcomes of all seeds"] = partial(plot_counts, counts=findings.outcomes, colours=colours)
     panels["length of episodes [steps]"] = partial(_plot_values, values=[entry.steps for entry in entries])
@@ -103,11 +103,11 @@ def _panels(findings: StoreReport) -> Panels:
     for index, name in enumerate(spec.action):
         labels = findings.actions[:, index]
         panels[name + in_brackets(spec.units[index])] = partial(_plot_numbers, values=labels, log=True)
-    drawn: dict[str, list[Any]] = {}
+    draws: dict[str, list[Any]] = {}
     for entry in entries:
         for name, value in flat(entry.draws).items():
-            drawn.setdefault(name, []).append(value)
-    varied = {name: values for name, values in drawn.items() if len({str(value) for value in values}) > 1}
+            draws.setdefault(name, []).append(value)
+    varied = {name: values for name, values in draws.items() if len({str(value) for value in values}) > 1}
     shown_draws = [*varied.items()][:DRAWN]
     return panels | {name: partial(_plot_values, values=values) for name, values in shown_draws}
 
@@ -116,7 +116,7 @@ def _plot_values(axes: Axes, values: Sequence[Any]) -> None:
     """Plot counts of words, a scatter plot of pairs, or a histogram of all else."""
     items = leaves(values)
     if not numeric(items):
-        plot_counts(axes, _most([*map(str, items)]), [BLUE])
+        plot_counts(axes, _most_frequent([*map(str, items)]), [BLUE])
     elif all(isinstance(value, list) and len(value) == 2 and numeric(value) for value in values):
         axes.scatter(*np.transpose(values), s=10, c=BLUE, alpha=0.5, linewidths=0)
         axes.set_aspect("equal", adjustable="datalim")

@@ -36,7 +36,7 @@ def write_report(
         "conditions": {
             name: {
                 **summary(other),
-                "compared": {key: asdict(each) for key, each in (compared or {}).get(name, {}).items()},
+                "compared": {key: asdict(comparison) for key, comparison in (compared or {}).get(name, {}).items()},
                 "outcomes": [result.outcome for result in other.results],
                 "reached": [result.milestones for result in other.results],
                 "motions": [result.motion and asdict(result.motion) for result in other.results],
@@ -52,7 +52,7 @@ def write_report(
 def summary(report: Report) -> dict[str, Any]:
     """Summarise a report for JSON: rates with intervals, outcomes and motion."""
     low, high = report.interval
-    found: dict[str, Any] = {
+    content: dict[str, Any] = {
         "success": report.success,
         "ci_low": low,
         "ci_high": high,
@@ -64,11 +64,11 @@ def summary(report: Report) -> dict[str, Any]:
         "anytime": report.anytime,
     }
     for kind, rates in report.rates.items():
-        found[kind] = {name: {"rate": each.rate, **each._asdict()} for name, each in rates.items()}
+        content[kind] = {name: {"rate": counted.rate, **counted._asdict()} for name, counted in rates.items()}
     for name, mean in (("mean_in_a_row", report.mean_in_a_row), ("mean_over_tiers", report.mean_over_tiers)):
         if mean:
-            found[name] = dict(zip(("mean", "ci_low", "ci_high"), mean, strict=True))
-    return found
+            content[name] = dict(zip(("mean", "ci_low", "ci_high"), mean, strict=True))
+    return content
 
 
 def plot_report(report: Report, path: Path) -> None:

@@ -54,17 +54,17 @@ def groups(values: Sequence[Any]) -> list[list[int]]:
     """Group the indices of episodes: few values or words by value, other numbers by quantiles, points by quadrants."""
     if isinstance(values[0], tuple):
         values = [str(quarter) for quarter in np.array(values) > np.median(values, axis=0)]
-    different = sorted(set(values), key=None if numeric(values) else str)
-    if len(different) <= BINS or not numeric(values):
-        return [[index for index, other in enumerate(values) if other == value] for value in different]
+    levels = sorted(set(values), key=None if numeric(values) else str)
+    if len(levels) <= BINS or not numeric(values):
+        return [[index for index, other in enumerate(values) if other == value] for value in levels]
     return [group.tolist() for group in np.array_split(np.argsort(values, kind="stable"), BINS)]
 
 
 def association(values: Sequence[Any], played: Sequence[Result]) -> float:
     """Association of success, which must vary, with a factor: Pearson's χ² per degree of freedom, about 1 by chance."""
-    good = np.array([result.success for result in played], dtype=float)
-    rate, split = good.mean(), groups(values)
-    squares = sum(len(group) * (good[group].mean() - rate) ** 2 for group in split)
+    successes = np.array([result.success for result in played], dtype=float)
+    rate, split = successes.mean(), groups(values)
+    squares = sum(len(group) * (successes[group].mean() - rate) ** 2 for group in split)
     return float(squares / (rate * (1 - rate)) / (len(split) - 1))
 
 
@@ -74,17 +74,17 @@ def episode_panels(report: Report) -> Panels:
     Factors are left out if all episodes succeeded, or none.
     """
     played = [result for result in report.results if result.outcome != ERROR]
-    varied = factors(played) if len({result.success for result in played}) > 1 else {}
-    shown = dict(sorted(varied.items(), key=lambda factor: -association(factor[1], played))[:FACTORS])
-    rates = {name: _rates_of(values, played) for name, values in shown.items() if not isinstance(values[0], tuple)}
-    limits = rate_limits(min((low for each in rates.values() for _, low, _ in each), default=0.0))  # shared
+    candidates = factors(played) if len({result.success for result in played}) > 1 else {}
+    selection = dict(sorted(candidates.items(), key=lambda factor: -association(factor[1], played))[:FACTORS])
+    rates = {name: _rates_of(values, played) for name, values in selection.items() if not isinstance(values[0], tuple)}
+    limits = rate_limits(min((low for intervals in rates.values() for _, low, _ in intervals), default=0.0))  # shared
     outcomes = {in_words(name): count for name, count in report.outcome_counts.items()}
     colours = [{"success": GREEN, ERROR: GREY}.get(name, RED) for name in report.outcome_counts]
     panels: Panels = {
         "outcomes": partial(plot_counts, counts=outcomes, colours=colours),
         "length of episodes [steps]": partial(_plot_lengths, played=played),
     }
-    for name, values in shown.items():
+    for name, values in selection.items():
         if name in rates:
             panels[name] = partial(_plot_rates, values=values, rates=rates[name], limits=limits)
         else:
@@ -105,16 +105,16 @@ def _plot_lengths(axes: Axes, played: Sequence[Result]) -> None:
 def _plot_points(axes: Axes, points: Sequence[tuple[float, float]], played: Sequence[Result]) -> None:
     """Scatter successes and failures over a two-dimensional factor, failures on top."""
     for good, colour, marker in ((True, GREEN, "o"), (False, RED, "X")):
-        chosen = [point for point, result in zip(points, played, strict=True) if result.success == good]
-        across, along = np.array(chosen).reshape(-1, 2).T
-        axes.scatter(across, along, c=colour, marker=marker, s=16, alpha=0.75, linewidths=0)
+        subset = [point for point, result in zip(points, played, strict=True) if result.success == good]
+        x, y = np.array(subset).reshape(-1, 2).T
+        axes.scatter(x, y, c=colour, marker=marker, s=16, alpha=0.75, linewidths=0)
     axes.set_aspect("equal", adjustable="datalim")
 
 
 def _rates_of(values: Sequence[Any], played: Sequence[Result]) -> list[Interval]:
     """Return the success rate of each group of a factor, with its interval."""
     counts = [(sum(played[index].success for index in group), len(group)) for group in groups(values)]
-    return [(good / count, *wilson_interval(good, count)) for good, count in counts]
+    return [(successes / count, *wilson_interval(successes, count)) for successes, count in counts]
 
 
 def _plot_rates(axes: Axes, values: Sequence[Any], rates: Sequence[Interval], limits: tuple[float, float]) -> None:

@@ -24,37 +24,37 @@ def reset_panels(seeds: Sequence[int], observations: Sequence[Observation]) -> P
     """Return a panel per episode: the colour image of every camera, then its depth image, from near (blue) to far (red)
     in one range for all episodes; pixels without a return appear as near."""
     panels: Panels = {}
-    for seed, seen in zip(seeds, observations, strict=True):
-        images = [*seen.rgb.values()]
-        for name, depth in seen.depth.items():
-            everything = np.stack([each.depth[name] for each in observations])  # [mm]
-            low, high = np.percentile(everything[everything > 0], (1, 90)) if everything.any() else (0.0, 1.0)
+    for seed, observation in zip(seeds, observations, strict=True):
+        images = [*observation.rgb.values()]
+        for name, depth in observation.depth.items():
+            all_depths = np.stack([other.depth[name] for other in observations])  # [mm]
+            low, high = np.percentile(all_depths[all_depths > 0], (1, 90)) if all_depths.any() else (0.0, 1.0)
             shades = np.clip((depth - low) / max(high - low, 1.0), 0, 1)
             images.append((255 * colormaps["turbo"](shades)[..., :3]).astype(np.uint8))
-        panels[f"seed {seed}: {seen.instruction}"] = partial(plot_image, image=np.concatenate(images, axis=1))
+        panels[f"seed {seed}: {observation.instruction}"] = partial(plot_image, image=np.concatenate(images, axis=1))
     return panels
 
 
 def draws_table(seeds: Sequence[int], draws: Sequence[Mapping[str, Any]]) -> Table:
     """Tabulate the draws of several resets: range of numbers or set of words, and the values of the first reset."""
-    first, rows = flat(draws[0]), []
+    first_draws, rows = flat(draws[0]), []
     for name, span in spans(draws).items():
-        values = [f"{leaf:.3g}" if isinstance(leaf, float) else str(leaf) for leaf in leaves(first.get(name))]
+        values = [f"{leaf:.3g}" if isinstance(leaf, float) else str(leaf) for leaf in leaves(first_draws.get(name))]
         rows.append([name, span, " ".join(values)])
     return Table(("draw", "range", f"seed {seeds[0]}"), rows, f"resets: {len(draws)}")
 
 
 def spans(draws: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Return dotted name → range of the numbers, or set of the words, drawn under that name."""
-    drawn: dict[str, list[Any]] = {}
+    values_by_name: dict[str, list[Any]] = {}
     for draw in draws:
         for name, value in flat(draw).items():
-            drawn.setdefault(name, []).extend(leaves(value))
+            values_by_name.setdefault(name, []).extend(leaves(value))
     return {
         name: f"{min(values):.4g} … {max(values):.4g}"
         if values and all(isinstance(value, (int, float)) for value in values)
         else ", ".join(sorted({str(value) for value in values}))
-        for name, values in drawn.items()
+        for name, values in values_by_name.items()
     }
 
 
@@ -84,9 +84,9 @@ def _plot(axes: Axes, frames: list[Array], action: Array, spec: Spec) -> None:
     places = step * (np.arange(len(action)) + 0.5)
     axes.barh(places, 0.5 * height * shares, 0.6 * step, left=left, color=GREEN, clip_on=False)
     for place, name, value, unit in zip(places, spec.action, action, spec.units, strict=True):
-        factor, shown = readable(unit)
+        factor, label = readable(unit)
         number = factor * float(value)
-        text = f"{round(number, 1) + 0.0:.1f} {shown}" if shown else f"{round(number, 4) + 0.0:.2g}"  # never "-0.0"
+        text = f"{round(number, 1) + 0.0:.1f} {label}" if label else f"{round(number, 4) + 0.0:.2g}"  # never "-0.0"
         axes.text(left - 0.55 * height, place, name, ha="right", va="center", fontsize=7)
         axes.text(left + 0.55 * height, place, text, va="center", fontsize=7)
     axes.set_xlim(right=left + height)

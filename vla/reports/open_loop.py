@@ -42,7 +42,7 @@ def write_errors(
     episodes = zip(result.seeds, result.recorded, result.errors.tolist(), strict=True)
     content = {
         "seeds": result.seeds,
-        "components": [asdict(each) for each in components(result)],
+        "components": [asdict(component) for component in components(result)],
         "relative": result.relative,
         "checkpoint": checkpoint,
         **facts,
@@ -55,11 +55,11 @@ def write_errors(
 def errors_table(errors: Sequence[ComponentError], episodes: int) -> Table:
     """Tabulate the errors over so many episodes with their intervals, in readable units."""
     rows = []
-    for each in errors:
-        factor, unit = readable(each.unit)
-        error, low, still = (f"{factor * value:.3g}" for value in (each.error, each.ci_low, each.constant))
-        high = "∞" if each.ci_high is None else f"{factor * each.ci_high:.3g}"
-        rows.append([each.name, unit, error, f"{low}-{high}", still])
+    for entry in errors:
+        factor, unit = readable(entry.unit)
+        error, low, constant = (f"{factor * value:.3g}" for value in (entry.error, entry.ci_low, entry.constant))
+        high = "∞" if entry.ci_high is None else f"{factor * entry.ci_high:.3g}"
+        rows.append([entry.name, unit, error, f"{low}-{high}", constant])
     heads = ("component", "unit", "error", "95 % CI", "of a constant action")
     if not any(unit for _, unit, *_ in rows):  # recordings have no units
         heads, rows = tuple(head for head in heads if head != "unit"), [[name, *rest] for name, _, *rest in rows]
@@ -69,18 +69,18 @@ def errors_table(errors: Sequence[ComponentError], episodes: int) -> Table:
 def plot_errors(result: OpenLoop, path: Path) -> None:
     """Plot the errors as fractions of those of a constant action, and the actions of the episode of median error."""
     relative = result.errors / result.errors.mean(0).clip(1e-12)  # components of any unit count alike
-    typical = int(np.argsort(relative.mean(1))[len(result.seeds) // 2])
+    median_index = int(np.argsort(relative.mean(1))[len(result.seeds) // 2])
     panels: Panels = {"error, as a fraction of a constant action's": partial(_plot_relative, result=result)}
     for index, name in enumerate(result.spec.action):
         title = name + in_brackets(result.spec.units[index])
-        panels[title] = partial(_plot_actions, result=result, episode=typical, component=index)
-    title = f"episode {result.seeds[typical]}: recorded (grey) and predicted (blue) actions over time [s]"
+        panels[title] = partial(_plot_actions, result=result, episode=median_index, component=index)
+    title = f"episode {result.seeds[median_index]}: recorded (grey) and predicted (blue) actions over time [s]"
     save(path, panels, 4, title=title, ink=MIDDLE)
 
 
 def _plot_relative(axes: Axes, result: OpenLoop) -> None:
     places = np.arange(len(result.spec.action))
-    error, low, high = (each / result.scale for each in (result.mean, *result.interval))
+    error, low, high = (values / result.scale for values in (result.mean, *result.interval))
     axes.barh(places, error, color=GREEN, height=0.6)
     if np.isfinite(high).all():
         axes.errorbar(error, places, xerr=[error - low, high - error], fmt="none", ecolor=GREY, capsize=3)

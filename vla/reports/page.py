@@ -67,7 +67,7 @@ def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bo
         title=title,
         parts=parts,
         written=f"{datetime.now():%Y-%m-%d %H:%M}",
-        notes=notes.format(*(f"{EARLY} {each}" if anytime else each for each in (WILSON, EXACT))),
+        notes=notes.format(*(f"{EARLY} {note}" if anytime else note for note in (WILSON, EXACT))),
         **content,
     )
     write_text(path, text)

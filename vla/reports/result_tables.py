@@ -32,8 +32,8 @@ def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Mappi
     Below a condition there is a row for each of its tasks, if it has several and the table stays short. Conditions that
     share the report of the first one, because they change nothing, are named below the table.
     """
-    first, *others = reports
-    equal = [name for name in others if reports[name] is reports[first]]
+    first_name, *names = reports
+    equal = [name for name in names if reports[name] is reports[first_name]]
     detailed = sum(len(report.tasks) for report in reports.values()) <= TASKS
     rows = []
     for name, report in reports.items():
@@ -41,7 +41,7 @@ def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Mappi
             rows.append([name, *cells(report.counted()), *difference(compared.get(name, {}).get(SUCCESS))])
             tasks = report.tasks if detailed and len(report.tasks) > 1 else {}
             rows += [[f"  {task}", *cells(part.counted()), *difference(None)] for task, part in tasks.items()]
-    note = f"the same as {first}, because they change nothing in the task: {', '.join(equal)}" if equal else ""
+    note = f"the same as {first_name}, because they change nothing in the task: {', '.join(equal)}" if equal else ""
     heads = ("condition", "success [%]", "episodes", *DIFFERENCE)
     return Table(heads, rows, "Success under other conditions, on the same seeds", note, ("p",))
 
@@ -56,10 +56,10 @@ def secondary_table(
 ) -> Table:
     """Tabulate differences in milestones and motion, in a row per case that has any; `heads` name its columns."""
     cases = {words: metrics for words, metrics in compared.items() if {*metrics} - {SUCCESS}}
-    found = {name for metrics in cases.values() for name in metrics} - {SUCCESS}
-    names = [*(name for name in AMOUNTS if name in found), *sorted(found - {*AMOUNTS})]
+    unordered = {name for metrics in cases.values() for name in metrics} - {SUCCESS}
+    names = [*(name for name in AMOUNTS if name in unordered), *sorted(unordered - {*AMOUNTS})]
     lines = [
-        [*words, *(_secondary(name, metrics[name]) if name in metrics else "" for name in names)]
+        [*words, *(_metric_cell(name, metrics[name]) if name in metrics else "" for name in names)]
         for words, metrics in cases.items()
     ]
     note = (
@@ -70,16 +70,16 @@ def secondary_table(
     return Table([*heads, *titles], lines, "Differences in secondary metrics", note)
 
 
-def _secondary(name: str, found: Comparison) -> str:
+def _metric_cell(name: str, test: Comparison) -> str:
     factor, digits = (1, "+.2g") if name in AMOUNTS else (100, "+.1f")
-    middle, low, high = (f"{factor * each:{digits}}" for each in (found.difference, found.ci_low, found.ci_high))
-    decided = found.p_holm is not None and found.p_holm <= LEVEL
+    middle, low, high = (f"{factor * value:{digits}}" for value in (test.difference, test.ci_low, test.ci_high))
+    decided = test.p_holm is not None and test.p_holm <= LEVEL
     return f"{middle}{' *' if decided else ''} ({low} to {high})"
 
 
 def rate_tables(report: Report) -> list[Table]:
     """Tabulate success by tier and task, instructions completed in a row, milestones and motion."""
-    rows = {kind: [[name, *cells(each)] for name, each in rates.items()] for kind, rates in report.rates.items()}
+    rows = {kind: [[name, *cells(counted)] for name, counted in rates.items()] for kind, rates in report.rates.items()}
     if report.mean_over_tiers:
         rows["tiers"].append([report.mean_label, rate(report.mean_over_tiers), ""])
     mean = "; on average {:.2f} ({:.2f}-{:.2f})".format(*report.mean_in_a_row) if report.mean_in_a_row else ""

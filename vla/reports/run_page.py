@@ -38,9 +38,9 @@ def write_page(folder: Path) -> Path:
     """
     run = read_run(folder)
     report = run.reports.get(IN_DISTRIBUTION)
-    others = run.report.conditions if run.report else {}
-    compared = {name: part.compared for name, part in others.items()}
-    changes = [[each.key, config_value(each.here), config_value(each.default)] for each in run.changes or ()]
+    conditions = run.report.conditions if run.report else {}
+    compared = {name: part.compared for name, part in conditions.items()}
+    changes = [[change.key, config_value(change.here), config_value(change.default)] for change in run.changes or ()]
     parts = [
         Section("", facts=_facts(run)),
         *([errors_table(run.errors.components, len(run.errors.seeds))] if run.errors else []),
@@ -48,8 +48,8 @@ def write_page(folder: Path) -> Path:
         _rounds(run),
         _rollouts(run),
         Section("Episodes", PLAYED, panels=svgs(episode_panels(report)) if report else {}),
-        *([conditions_table(run.reports, compared)] if others else []),
-        secondary_table({(name,): found for name, found in compared.items()}),
+        *([conditions_table(run.reports, compared)] if conditions else []),
+        secondary_table({(name,): metrics for name, metrics in compared.items()}),
         *(rate_tables(report) if report else ()),
         *training_sections([(GREEN, run.metrics)]),
         Section("First training batch", WINDOWS, picture=folder / SAMPLES),
@@ -61,9 +61,9 @@ def write_page(folder: Path) -> Path:
         folder / PAGE,
         " · ".join(filter(None, (run.policy, _tasks(run)))) or title,
         parts,
-        any(each.anytime for each in run.reports.values()),
+        any(part.anytime for part in run.reports.values()),
         subtitle=title,
-        warning=_ended(run),
+        warning=_warning(run),
         rate=f"{percent(report.success)} %" if report else "",
         of=str(report).splitlines()[-1] if report else "",
     )
@@ -72,21 +72,21 @@ def write_page(folder: Path) -> Path:
 def _tasks(run: Run) -> str:
     """Return the names of the evaluated tasks, or how many there are; without any, the goal's or task's class."""
     classes = (str(at(run.config, key, "")).rpartition(".")[2] for key in ("task.goal._target_", "task._target_"))
-    spaced = (re.sub(r"(?<=[a-z])(?=[A-Z])", " ", each).lower() for each in classes)
-    tasks = [in_words(task) for task in run.tasks] or [*filter(None, spaced)][:1]
+    words = (re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower() for name in classes)
+    tasks = [in_words(task) for task in run.tasks] or [*filter(None, words)][:1]
     return ", ".join(tasks) if len(tasks) <= NAMED else f"{len(tasks)} tasks"
 
 
-def _ended(run: Run) -> str:
+def _warning(run: Run) -> str:
     """Return a sentence on how an incomplete training ended; "" if it was completed, or there was none."""
     if not (training := run.training) or training.ended == "done":
         return ""
     if training.ended != "interrupted":
         return f"Training failed: {training.ended}"
-    return f"Training was interrupted after {counted(training.steps, 'step')}; resume={_near(run.folder)} continues it."
+    return f"Training was interrupted after {counted(training.steps, 'step')}; resume={_path(run.folder)} continues it."
 
 
-def _near(path: Path, *folders: Path) -> Path:
+def _path(path: Path, *folders: Path) -> Path:
     """Return a path relative to the first of the folders, and last the working directory, that contains it."""
     for folder in (*folders, Path.cwd()):
         if path.resolve().is_relative_to(folder.resolve()):
@@ -97,35 +97,35 @@ def _near(path: Path, *folders: Path) -> Path:
 def _facts(run: Run) -> dict[str, str]:
     """Return the facts at the top of a run's page: name → text."""
     training, report = run.training, run.report or run.errors
-    facts = {f"statement {number}": each for number, each in enumerate(run.report.statements if run.report else (), 1)}
+    facts = {f"statement {number}": text for number, text in enumerate(run.report.statements if run.report else (), 1)}
     if run.parameters is not None:
         facts["parameters"] = f"{run.parameters / 1e6:.2f} M"
     if report and report.latency_ms:
         facts["time per action"] = f"{report.latency_ms:.1f} ms"
     if training:
         facts["training"] = f"{counted(training.steps, 'step')} in {duration(training.seconds)}"
-        asked = {"demonstrations": "collect.episodes", "and those in": "collect.more", "from weights of": "pretrained"}
-        known = {name: at(run.config, key, None) for name, key in asked.items()}
-        facts |= {name: config_value(value) for name, value in known.items() if value is not None}
+        keys = {"demonstrations": "collect.episodes", "and those in": "collect.more", "from weights of": "pretrained"}
+        values = {name: at(run.config, key, None) for name, key in keys.items()}
+        facts |= {name: config_value(value) for name, value in values.items() if value is not None}
     if report and report.seeds:
         seeds = counted(len(report.seeds), "seed" if run.report else "held-out episode")
         facts["evaluated on"] = f"{seeds}: {listed(report.seeds)}"
     if report and report.checkpoint:
-        facts["checkpoint"] = str(_near(Path(report.checkpoint), run.folder))
+        facts["checkpoint"] = str(_path(Path(report.checkpoint), run.folder))
     return facts
 
 
 def _rounds(run: Run) -> Table:
     """Tabulate the rounds with the expert that have a page, success before each, and the evaluation after them."""
     rows = []
-    for page in sorted(run.folder.glob(f"round_*/{PAGE}"), key=lambda each: (len(each.parent.name), each)):
-        tried, _ = read_index(page.parent / EPISODES / INDEX, any_seed=False, damaged=False)
-        report = Report(tuple(Result(entry.seed, entry.outcome) for entry in tried if entry.stored))
-        name, trained = page.parent.name, read_run(page.parent)
+    for page in sorted(run.folder.glob(f"round_*/{PAGE}"), key=lambda path: (len(path.parent.name), path)):
+        entries, _ = read_index(page.parent / EPISODES / INDEX, any_seed=False, damaged=False)
+        report = Report(tuple(Result(entry.seed, entry.outcome) for entry in entries if entry.stored))
+        name, subrun = page.parent.name, read_run(page.parent)
         link = links({in_words(name): f"{quote(name)}/{PAGE}"})
-        validated = percent(curve[1][-1]) if (curve := trained.metrics.get("val/success")) else ""
-        length = (str(trained.training.steps), duration(trained.training.seconds)) if trained.training else ("", "")
-        rows.append([link, *(cells(report.counted()) if report.results else ("", "")), validated, *length])
+        validation = percent(curve[1][-1]) if (curve := subrun.metrics.get("val/success")) else ""
+        length = (str(subrun.training.steps), duration(subrun.training.seconds)) if subrun.training else ("", "")
+        rows.append([link, *(cells(report.counted()) if report.results else ("", "")), validation, *length])
     if rows and run.report:
         rows.append(["evaluation", *cells(run.reports[IN_DISTRIBUTION].counted()), "", "", ""])
     heads = ("round", "success before it [%]", "episodes", "in validation after it [%]", "steps", "training")
@@ -134,37 +134,37 @@ def _rounds(run: Run) -> Table:
 
 def _rollouts(run: Run) -> Section:
     """Return the moving pictures, what the recording contains, and how to record another episode."""
-    results = [each for each in run.report.per_episode if each.outcome != ERROR] if run.report else []
+    results = [result for result in run.report.per_episode if result.outcome != ERROR] if run.report else []
     pictures, facts = pictured(results, run.folder / RECORDINGS), dict[str, str]()
     if (run.folder / RECORDING).is_file() and run.report:
-        recorded = {*run.report.recorded}
+        seeds = {*run.report.recorded}
         counts = [
-            f"{sum(each.seed in recorded for each in played)} of {counted(len(played), name)}"
+            f"{sum(result.seed in seeds for result in group)} of {counted(len(group), name)}"
             for name, good in (("failure", False), ("success", True))
-            if (played := [each for each in results if each.success == good])
+            if (group := [result for result in results if result.success == good])
         ]
         facts["recording"] = links({RECORDING: RECORDING}) + f" has {' and '.join(counts)}; rerun {RECORDING} plays it"
         policy = f"agent={at(run.config, 'chosen.agent')}"
-        policy = f"checkpoint={_near(Path(run.report.checkpoint))}" if run.report.checkpoint else policy
+        policy = f"checkpoint={_path(Path(run.report.checkpoint))}" if run.report.checkpoint else policy
         command = f"python -m vla.run {policy} evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
         facts["record another"] = command if run.training else f"{command}, and the task's options of the command below"
-    if single := sorted(file.name for file in (run.folder / RECORDINGS).glob("*.rrd")):
-        more = f" and {len(single) - LISTED} more in {RECORDINGS}" if len(single) > LISTED else ""
-        facts["single recordings"] = links({name: f"{RECORDINGS}/{quote(name)}" for name in single[:LISTED]}) + more
-    moving = shown(each for each in results if each.seed in pictures)
-    return Section("Rollouts", ROLLOUTS, facts, rollouts=[(each, pictures[each.seed]) for each in moving])
+    if names := sorted(file.name for file in (run.folder / RECORDINGS).glob("*.rrd")):
+        rest = f" and {len(names) - LISTED} more in {RECORDINGS}" if len(names) > LISTED else ""
+        facts["single recordings"] = links({name: f"{RECORDINGS}/{quote(name)}" for name in names[:LISTED]}) + rest
+    rollouts = shown(result for result in results if result.seed in pictures)
+    return Section("Rollouts", ROLLOUTS, facts, rollouts=[(result, pictures[result.seed]) for result in rollouts])
 
 
 def _origins(run: Run) -> list[Section]:
     """Return command line, commits and machine of each part of the work; a single section if all are alike."""
-    begun, evaluated = run.training.origins if run.training else [], run.report or run.errors
-    known = {f" of the training{f', part {part}' if part > 1 else ''}": each for part, each in enumerate(begun, 1)}
-    if evaluated and evaluated.origin:
-        known[" of the evaluation"] = evaluated.origin
-    if len({str(origin) for origin in known.values()}) == 1:
-        known = {"": next(iter(known.values()))}
+    stages, evaluation = run.training.origins if run.training else [], run.report or run.errors
+    parts = {f" of the training{f', part {part}' if part > 1 else ''}": origin for part, origin in enumerate(stages, 1)}
+    if evaluation and evaluation.origin:
+        parts[" of the evaluation"] = evaluation.origin
+    if len({str(origin) for origin in parts.values()}) == 1:
+        parts = {"": next(iter(parts.values()))}
     sections = []
-    for part, origin in known.items():
+    for part, origin in parts.items():
         commits = ", ".join(f"{commit} ({tree})" for tree, commit in origin.commits.items())
         facts = {"command": origin.command, "git commit": commits, "host": origin.host, "processor": origin.processor}
         sections.append(Section(f"Origin{part}", facts={name: fact for name, fact in facts.items() if fact}))

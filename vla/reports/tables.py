@@ -40,13 +40,13 @@ class Table:
 
     def __rich__(self) -> RichTable:
         """Return the table for a terminal of 80 columns."""
-        shown = [column for column, head in enumerate(self.heads) if head not in self.details]
-        narrow: dict[str, Any] = {"box": SIMPLE_HEAD, "collapse_padding": True, "pad_edge": False}
-        table = RichTable(title=escape(self.title), caption=escape(self.note), **narrow)
-        for column in shown:
+        columns = [column for column, head in enumerate(self.heads) if head not in self.details]
+        style: dict[str, Any] = {"box": SIMPLE_HEAD, "collapse_padding": True, "pad_edge": False}
+        table = RichTable(title=escape(self.title), caption=escape(self.note), **style)
+        for column in columns:
             table.add_column(escape(self.heads[column]))
         for row in self.rows:
-            table.add_row(*(escape(row[column]) for column in shown))
+            table.add_row(*(escape(row[column]) for column in columns))
         return table
 
     def markdown(self) -> str:
@@ -70,14 +70,14 @@ def difference(found: Comparison | None) -> list[str]:
     """Return a difference in success as the cells of `DIFFERENCE`; empty ones without a comparison."""
     if found is None:
         return [""] * len(DIFFERENCE)
-    middle, low, high = (f"{100 * each:+.1f}" for each in (found.difference, found.ci_low, found.ci_high))
-    together = "" if found.p_holm is None else f"{found.p_holm:.2g}"
-    return [f"{middle} ({low} to {high})", f"{found.p:.2g}", together, found.verdict]
+    middle, low, high = (f"{100 * share:+.1f}" for share in (found.difference, found.ci_low, found.ci_high))
+    p_holm = "" if found.p_holm is None else f"{found.p_holm:.2g}"
+    return [f"{middle} ({low} to {high})", f"{found.p:.2g}", p_holm, found.verdict]
 
 
 def links(addresses: Mapping[str, str]) -> Markup:
     """Return links, text → address."""
-    return Markup(" ").join(Markup('<a href="{}">{}</a>').format(at, text) for text, at in addresses.items())
+    return Markup(" ").join(Markup('<a href="{}">{}</a>').format(address, text) for text, address in addresses.items())
 
 
 def config_value(content: Any) -> str:

@@ -32,9 +32,9 @@ def training_sections(runs: Sequence[tuple[str, Mapping[str, Curve]]]) -> list[S
             part.setdefault(_title(name), []).append((not name.startswith("val/"), colour, curve))
     sections = []
     for heading, panels in parts.items():
-        ordered = sorted(panels, key=lambda title: (all(training for training, _, _ in panels[title]), title != "loss"))
-        drawn = svgs({title: partial(_plot, title=title, lines=panels[title]) for title in ordered})
-        sections.append(Section(heading, NOTE, panels=drawn))
+        titles = sorted(panels, key=lambda title: (all(training for training, _, _ in panels[title]), title != "loss"))
+        drawings = svgs({title: partial(_plot, title=title, lines=panels[title]) for title in titles})
+        sections.append(Section(heading, NOTE, panels=drawings))
     return sections
 
 
@@ -46,9 +46,9 @@ def _title(name: str) -> str:
 
 def _plot(axes: Axes, title: str, lines: Sequence[Line]) -> None:
     for training, colour, (steps, values) in lines:
-        few = "o" if len(steps) < (2 if training else 30) else ""  # a line of one point would not be seen
+        marker = "o" if len(steps) < (2 if training else 30) else ""  # a line of one point would not be seen
         width = 1.0 if training else 1.8
-        axes.plot(steps, values, f"{few}-", color=colour, linewidth=width, markersize=3, clip_on=title != "success")
+        axes.plot(steps, values, f"{marker}-", color=colour, linewidth=width, markersize=3, clip_on=title != "success")
     if title.endswith("loss") and _spans_decades(lines):
         axes.set_yscale("log", subs=[2, 5])
         axes.yaxis.set_minor_formatter("{x:g}")

@@ -48,8 +48,8 @@ class Summary:
         """Summarise a store."""
         tried = [entry for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED)]
         failures = Counter(entry.outcome for entry in tried if not entry.success)
-        solved, every = Counter(entry.task for entry in tried if entry.success), Counter(entry.task for entry in tried)
-        tasks = {task: (solved[task], every[task]) for task in sorted(every)}
+        solved, tries = Counter(entry.task for entry in tried if entry.success), Counter(entry.task for entry in tried)
+        tasks = {task: (solved[task], tries[task]) for task in sorted(tries)}
         return cls(len(store.episodes), solved.total(), added, len(tried), dict(failures), tasks, seconds)
 
     @property
@@ -75,28 +75,28 @@ def collect(
     `keep_failures` every seed gives an episode: failures are stored and count too. Raises a UserError if the store
     starts at another seed or is derived, the expert fails persistently, workers died, or the disk is full.
     """
-    started, before = time.monotonic(), len(store.episodes)
+    start, initial_count = time.monotonic(), len(store.episodes)
     store.require_first_seed(seed)
-    if before < episodes:
+    if initial_count < episodes:
         store.require_growable()
         with store.writing():  # waits for another process, which may have added some
-            before = len(store.episodes)
+            initial_count = len(store.episodes)
             store.require_first_seed(seed)
-            if before < episodes:
+            if initial_count < episodes:
                 make = partial(DemonstrationWorker, make_environment, make_expert, keep_failures)
                 _fill_with(cluster, make, store, partial(_fill, store, episodes, seed, multitask, keep_failures))
-    return Summary.of(store, len(store.episodes) - before, time.monotonic() - started)
+    return Summary.of(store, len(store.episodes) - initial_count, time.monotonic() - start)
 
 
 def _fill_with(cluster: Cluster, make: WorkerFactory, store: EpisodeStore, fill: Callable[[Pool], None]) -> None:
     """Fill the store, restarting workers that died: in long collections processes occasionally crash outside Python."""
     while True:
-        tried = len(store.tried)
+        attempts = len(store.tried)
         try:
             with cluster.pool(make) as pool:
                 return fill(pool)
         except WorkersLost as lost:
-            if len(store.tried) == tried:
+            if len(store.tried) == attempts:
                 raise WorkersLost(f"{lost}; committed episodes are safe, run again to continue") from lost
             log.warning("workers were lost after %s; continuing with new ones", counted(len(store.episodes), "episode"))
 
@@ -111,10 +111,10 @@ class _Attempts:
         """Continue a store, or begin it at the seed `first`; without `multitask` all seeds are of one task."""
         self._pool = pool
         self._task_of = multitask.task_of if multitask else lambda seed: ""
-        self._solved = dict.fromkeys(multitask.tasks if multitask else [""], 0)
+        self._successes = dict.fromkeys(multitask.tasks if multitask else [""], 0)
         for entry in store.episodes:
-            self._solved[self._task_of(entry.seed)] += entry.success
-        self._next = first if store.next_seed is None else store.next_seed
+            self._successes[self._task_of(entry.seed)] += entry.success
+        self._next_seed = first if store.next_seed is None else store.next_seed
         self._pending: deque[tuple[int, Future | None]] = deque()
 
     def next(self, most: int) -> Episode:
@@ -125,40 +125,40 @@ class _Attempts:
         self._advance(most)
         seed, future = self._pending.popleft()
         task = self._task_of(seed)
-        if not _needed(task, self._solved):
+        if not _is_needed(task, self._successes):
             return Episode(seed, task, "", NOT_NEEDED)
         episode: Episode = (future or self._pool.submit(seed)).result()
-        self._solved[task] += episode.success
+        self._successes[task] += episode.success
         return episode
 
     def _advance(self, most: int) -> None:
-        going = [seed for seed, future in self._pending if future is not None]
-        expected = Counter(self._solved) + Counter(self._task_of(seed) for seed in going)
-        expected = {task: expected[task] for task in self._solved}
-        missing = most - len(going)
+        seeds = [seed for seed, future in self._pending if future is not None]
+        expected = Counter(self._successes) + Counter(self._task_of(seed) for seed in seeds)
+        expected = {task: expected[task] for task in self._successes}
+        missing = most - len(seeds)
         while missing > 0:
-            if self._next >= FIRST_SEED:
+            if self._next_seed >= FIRST_SEED:
                 raise UserError(f"seeds from {FIRST_SEED} on are reserved for evaluation: lower collect.seed")
-            task = self._task_of(self._next)
-            needed = _needed(task, expected)
-            self._pending.append((self._next, self._pool.submit(self._next) if needed else None))
+            task = self._task_of(self._next_seed)
+            needed = _is_needed(task, expected)
+            self._pending.append((self._next_seed, self._pool.submit(self._next_seed) if needed else None))
             expected[task] += needed
             missing -= needed
-            self._next += 1
+            self._next_seed += 1
 
 
-def _needed(task: str, solved: Mapping[str, int]) -> bool:
-    return solved[task] == min(solved.values())
+def _is_needed(task: str, successes: Mapping[str, int]) -> bool:
+    return successes[task] == min(successes.values())
 
 
 def _fill(
     store: EpisodeStore, episodes: int, seed: int, multitask: Multitask | None, keep_failures: bool, pool: Pool
 ) -> None:
     """Append episodes until the store has `episodes`; raise a UserError if the expert fails too often in a row."""
-    before, attempts, started = len(store.episodes), _Attempts(pool, multitask, store, seed), time.monotonic()
+    initial_count, attempts, start = len(store.episodes), _Attempts(pool, multitask, store, seed), time.monotonic()
     outcomes = Counter(entry.success for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED))
     in_a_row = defaultdict[str, list[str]](list)  # task → outcomes of the failures since its last success
-    with Bar("collecting", episodes, before) as bar:
+    with Bar("collecting", episodes, initial_count) as bar:
         while (stored := len(store.episodes)) < episodes:
             # No more pending than missing: without failures no episode is wasted.
             episode = attempts.next(min(LOOK_AHEAD * pool.size, episodes - stored))
@@ -173,7 +173,7 @@ def _fill(
                 store.fail(episode)
                 in_a_row[episode.task].append(episode.outcome)
                 _give_up_after(episode.task, in_a_row[episode.task])
-            speed = (len(store.episodes) - before) / (time.monotonic() - started)
+            speed = (len(store.episodes) - initial_count) / (time.monotonic() - start)
             rate = outcomes[True] / outcomes.total()
             bar.show(len(store.episodes), f"{speed:.1f} episodes/s, success {rate:.0%}")
 
@@ -205,11 +205,11 @@ class DemonstrationWorker:
         if episode.success:
             complete = all(observation.rgb for observation in episode.observations)
             with self._environment.blind() if complete else nullcontext():
-                again = replay(self._environment, episode)
-            if again.differs is not None:
+                result = replay(self._environment, episode)
+            if result.differs is not None:
                 episode.outcome = NOT_REPEATABLE
             elif not complete:
-                episode.observations = again.observations
+                episode.observations = result.observations
         return episode if episode.success or self._keep_failures else replace(episode, observations=[])
 
     def close(self) -> None:

@@ -56,8 +56,8 @@ class Comparison:
         """
         decided = p_holm <= LEVEL
         if margin is None:
-            more = (self.only_second or 0) > (self.only_first or 0)  # the median may be 0
-            return replace(self, p_holm=p_holm, verdict="open" if not decided else "more" if more else "less")
+            is_more = (self.only_second or 0) > (self.only_first or 0)  # the median may be 0
+            return replace(self, p_holm=p_holm, verdict="open" if not decided else "more" if is_more else "less")
         points, bounded = f"{100 * margin:g} point{'' if margin == 0.01 else 's'}", self.ci_low > -margin
         if not decided:
             verdict = f"not worse by {points}" if bounded else "open"
@@ -74,10 +74,10 @@ def compare_pairs(pairs: Pairs, anytime: bool = False) -> Comparison:
     With `anytime` both are valid whatever the reason to stop playing, see `vla.rollouts.sequential`.
     """
     _, first, second, _ = pairs
-    played = sum(pairs)
-    low, high = anytime_difference(first, second, played) if anytime else newcombe_paired(pairs)
+    episodes = sum(pairs)
+    low, high = anytime_difference(first, second, episodes) if anytime else newcombe_paired(pairs)
     p = (anytime_p if anytime else mcnemar)(first, second)
-    return Comparison((second - first) / max(played, 1), low, high, p, played, first, second)
+    return Comparison((second - first) / max(episodes, 1), low, high, p, episodes, first, second)
 
 
 def compare_samples(won_first: float, first: float, won_second: float, second: float) -> Comparison:
@@ -100,17 +100,17 @@ def compare_amounts(first: Amounts, second: Amounts, anytime: bool = False) -> C
     differences = np.subtract(second, first)
     if (interval := median_interval(differences, anytime)) is None:
         return None
-    less, more = int((differences < 0).sum()), int((differences > 0).sum())
-    p = (anytime_p if anytime else mcnemar)(less, more)
-    return Comparison(float(np.median(differences)), *interval, p, len(differences), less, more)
+    decreases, increases = int((differences < 0).sum()), int((differences > 0).sum())
+    p = (anytime_p if anytime else mcnemar)(decreases, increases)
+    return Comparison(float(np.median(differences)), *interval, p, len(differences), decreases, increases)
 
 
 def fisher(won_first: int, first: int, won_second: int, second: int) -> float:
     """Return the two-sided p-value of Fisher's exact test for equal success rates: twice that of the smaller tail."""
     from scipy.stats import hypergeom  # the import takes a second
 
-    given = hypergeom(first + second, won_first + won_second, second)
-    return float(min(1.0, 2 * given.cdf(won_second), 2 * given.sf(won_second - 1)))
+    distribution = hypergeom(first + second, won_first + won_second, second)
+    return float(min(1.0, 2 * distribution.cdf(won_second), 2 * distribution.sf(won_second - 1)))
 
 
 def newcombe(won_first: float, first: float, won_second: float, second: float) -> tuple[float, float]:
@@ -119,9 +119,9 @@ def newcombe(won_first: float, first: float, won_second: float, second: float) -
     R. G. Newcombe, "Interval estimation for the difference between independent proportions: comparison of eleven
     methods", Statistics in Medicine 17 (1998), 873-890, method 10: it combines Wilson's intervals of both rates.
     """
-    (low, high), (below, above) = wilson_interval(won_first, first), wilson_interval(won_second, second)
+    (low_one, high_one), (low_two, high_two) = wilson_interval(won_first, first), wilson_interval(won_second, second)
     one, two = won_first / first, won_second / second
-    return two - one - hypot(two - below, high - one), two - one + hypot(above - two, one - low)
+    return two - one - hypot(two - low_two, high_one - one), two - one + hypot(high_two - two, one - low_one)
 
 
 def newcombe_paired(pairs: Pairs) -> tuple[float, float]:
@@ -131,20 +131,20 @@ def newcombe_paired(pairs: Pairs) -> tuple[float, float]:
     data", Statistics in Medicine 17 (1998), 2635-2650, method 10: it combines Wilson's intervals of both rates with the
     correlation of the pairs, whose numerator has a continuity correction.
     """
-    played = sum(pairs)
-    if played == 0:
+    size = sum(pairs)
+    if size == 0:
         return -1.0, 1.0
     both, first, second, neither = pairs
-    one, two = (both + first) / played, (both + second) / played
-    (low, high), (below, above) = wilson_interval(both + first, played), wilson_interval(both + second, played)
+    one, two = (both + first) / size, (both + second) / size
+    (low_one, high_one), (low_two, high_two) = wilson_interval(both + first, size), wilson_interval(both + second, size)
     product = (both + first) * (second + neither) * (both + second) * (first + neither)
-    apart = both * neither - first * second
-    correlation = (max(apart - played / 2, 0.0) if apart > 0 else apart) / sqrt(product) if product else 0.0
+    numerator = both * neither - first * second
+    correlation = (max(numerator - size / 2, 0.0) if numerator > 0 else numerator) / sqrt(product) if product else 0.0
 
     def reach(one: float, two: float) -> float:
         return sqrt(max(one**2 - 2 * correlation * one * two + two**2, 0.0))
 
-    return two - one - reach(two - below, high - one), two - one + reach(above - two, one - low)
+    return two - one - reach(two - low_two, high_one - one), two - one + reach(high_two - two, one - low_one)
 
 
 def pairs_of(
@@ -160,17 +160,17 @@ def compared_in(together: Together, anytime: bool) -> dict[str, Comparison]:
 
     Returns `SUCCESS`, field of `Motion` or milestone → comparison, without fields that too few pairs have.
     """
-    found = {SUCCESS: compare_pairs(pairs_of(together), anytime)}
+    comparisons = {SUCCESS: compare_pairs(pairs_of(together), anytime)}
     motions = [(one.motion, two.motion) for one, two in together if one.success and two.success]
     for name in AMOUNTS:
         pairs = [(getattr(one, name, None), getattr(two, name, None)) for one, two in motions]
-        known = np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
-        if compared := compare_amounts(known[:, 0], known[:, 1], anytime):
-            found[name] = compared
+        amounts = np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
+        if comparison := compare_amounts(amounts[:, 0], amounts[:, 1], anytime):
+            comparisons[name] = comparison
     alike = [(one, two) for one, two in together if one.task == two.task]  # another task may not have the milestone
     for name in sorted({name for pair in alike for result in pair for name in result.milestones}):
-        found[name] = compare_pairs(pairs_of(alike, lambda result, name=name: name in result.milestones), anytime)
-    return found
+        comparisons[name] = compare_pairs(pairs_of(alike, lambda result, name=name: name in result.milestones), anytime)
+    return comparisons
 
 
 def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str, dict[str, Comparison]]:
@@ -180,14 +180,14 @@ def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str
     non-inferiority is a difference of rates, 0…1. Raises a UserError if reports have different seeds.
     """
     (_, first), *others = reports.items()
-    found = {}
+    comparisons = {}
     for name, other in others:
         together, anytime = list(zip(first.results, other.results, strict=False)), first.anytime or other.anytime
-        longer = len(first.results) != len(other.results) and not anytime
-        if longer or any(one.seed != two.seed for one, two in together):
+        uneven = len(first.results) != len(other.results) and not anytime
+        if uneven or any(one.seed != two.seed for one, two in together):
             raise UserError("only reports on the same seeds can be compared")
-        found[name] = compared_in(together, anytime)
-    return concluded(found, margin)
+        comparisons[name] = compared_in(together, anytime)
+    return concluded(comparisons, margin)
 
 
 def concluded(cases: Mapping[Key, Mapping[str, Comparison]], margin: float | None) -> dict[Key, dict[str, Comparison]]:
@@ -199,12 +199,12 @@ def concluded(cases: Mapping[Key, Mapping[str, Comparison]], margin: float | Non
     """
     verdicts: dict[tuple[Key, str], Comparison] = {}
     for of_success in (True, False):
-        family = [((case, name), each) for case, of_case in cases.items() for name, each in of_case.items()]
-        family = [(key, each) for key, each in family if (key[1] == SUCCESS) == of_success]
-        can_differ = [each.only_first is None or each.only_first + (each.only_second or 0) > 0 for _, each in family]
+        family = [((case, name), test) for case, tests in cases.items() for name, test in tests.items()]
+        family = [(key, test) for key, test in family if (key[1] == SUCCESS) == of_success]
+        can_differ = [test.only_first is None or test.only_first + (test.only_second or 0) > 0 for _, test in family]
         remaining, adjusted = sum(can_differ), 0.0
-        for key, each in sorted(family, key=lambda item: item[1].p):
-            adjusted = max(adjusted, min(1.0, max(remaining, 1) * each.p))
-            verdicts[key] = each.conclude(adjusted, margin if of_success else None)
+        for key, test in sorted(family, key=lambda item: item[1].p):
+            adjusted = max(adjusted, min(1.0, max(remaining, 1) * test.p))
+            verdicts[key] = test.conclude(adjusted, margin if of_success else None)
             remaining -= 1
-    return {case: {name: verdicts[case, name] for name in of_case} for case, of_case in cases.items()}
+    return {case: {name: verdicts[case, name] for name in tests} for case, tests in cases.items()}

@@ -61,12 +61,12 @@ def evaluate(
     if not seeds or min(seeds) < FIRST_SEED:
         raise UserError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
     make = partial(_RolloutWorker, make_environment, make_agent, None if recordings == 0 else make_recorder, lanes)
-    at_once, score = recordings == "all", _Score(seeds, dict(known or {}), until, turns)
+    record_all, score = recordings == "all", _Score(seeds, dict(known or {}), until, turns)
     with cluster.pool(make) as pool:
-        _play_missing(pool, score, at_once, 1 if lanes == 1 else ROUNDS * lanes, name, keep or (lambda result: None))
+        _play_missing(pool, score, record_all, 1 if lanes == 1 else ROUNDS * lanes, name, keep or (lambda result: None))
         report = score.report()
-        if make_recorder is not None and not at_once and (again := chosen(report, recordings)):
-            _record(pool, again)
+        if make_recorder is not None and not record_all and (results := chosen(report, recordings)):
+            _record(pool, results)
     return report
 
 
@@ -75,15 +75,15 @@ def _play_missing(
 ) -> None:
     """Play the missing episodes in groups of `size`, until `score.until` is true of the results that count."""
     with Bar(name, len(score.seeds), len(score.results), score.note() if score.results else "") as bar:
-        missing = [] if score.advance() else [seed for seed in score.seeds if seed not in score.results]
-        groups = [missing[first : first + size] for first in range(0, len(missing), size)]
+        seeds = [] if score.advance() else [seed for seed in score.seeds if seed not in score.results]
+        groups = [seeds[start : start + size] for start in range(0, len(seeds), size)]
         group_of, crashed = {pool.submit((group, recorded)): group for group in groups}, False
         for future in pool.as_completed(group_of):
             results = _results(future, group_of[future])
             crashed |= not results
             if crashed and score.until is not None:  # later results count only after these
-                for later in group_of:
-                    later.cancel()
+                for pending in group_of:
+                    pending.cancel()
                 break
             for result in results:
                 score.add(result)
@@ -91,8 +91,8 @@ def _play_missing(
                     keep(result)
             bar.show(len(score.results), score.note())
             if score.advance():
-                for later in group_of:
-                    later.cancel()
+                for pending in group_of:
+                    pending.cancel()
                 return
     if crashed:  # one by one, to find out which of the episodes in a group it was
         _play_missing(pool, score, recorded, 1, name, keep)
@@ -147,24 +147,24 @@ def _results(future: Future, seeds: Sequence[int]) -> list[Result]:
 
 def _record(pool: Pool, results: Sequence[Result]) -> None:
     """Play episodes once more and record them; log a warning for those that are played differently."""
-    expected = {pool.submit(([result.seed], True)): result for result in results}
-    with Bar("recording", len(expected)) as bar:
-        for done, future in enumerate(pool.as_completed(expected), 1):
-            result = expected[future]
-            (again,) = _results(future, [result.seed])
-            bar.show(done)
-            if again.outcome != result.outcome:
-                ended = again.error or again.outcome
-                log.warning("seed %d has no recording: when played again it ended with %s", result.seed, ended)
-            elif again.steps != result.steps:
-                took = "the recording of seed %d differs from the evaluation: it has %d steps, not %d"
-                log.warning(took, result.seed, again.steps, result.steps)
+    originals = {pool.submit(([result.seed], True)): result for result in results}
+    with Bar("recording", len(originals)) as bar:
+        for count, future in enumerate(pool.as_completed(originals), 1):
+            result = originals[future]
+            (repeat,) = _results(future, [result.seed])
+            bar.show(count)
+            if repeat.outcome != result.outcome:
+                outcome = repeat.error or repeat.outcome
+                log.warning("seed %d has no recording: when played again it ended with %s", result.seed, outcome)
+            elif repeat.steps != result.steps:
+                text = "the recording of seed %d differs from the evaluation: it has %d steps, not %d"
+                log.warning(text, result.seed, repeat.steps, result.steps)
 
 
 def play_episode(environment: Environment, agent: Agent, seed: int) -> Result:
     """Play one episode; errors become results, so that one seed ends neither an evaluation nor a training."""
-    ((_, ended),) = play([Stage(environment)], in_lanes(agent), [seed], all_images=False)
-    return result_of(seed, ended, environment.spec.control_hz)
+    ((_, result),) = play([Stage(environment)], in_lanes(agent), [seed], all_images=False)
+    return result_of(seed, result, environment.spec.control_hz)
 
 
 def result_of(seed: int, ended: Episode | Exception, control_hz: float) -> Result:
@@ -188,9 +188,9 @@ def result_of(seed: int, ended: Episode | Exception, control_hz: float) -> Resul
             motion=motion,
         )
     except Exception as problem:  # of any kind: worlds are user code
-        where = traceback.extract_tb(problem.__traceback__)[-1]
-        what = f"{type(problem).__name__}: {problem} ({Path(where.filename).name}:{where.lineno})"
-        return Result(seed, ERROR, error=what)
+        frame = traceback.extract_tb(problem.__traceback__)[-1]
+        message = f"{type(problem).__name__}: {problem} ({Path(frame.filename).name}:{frame.lineno})"
+        return Result(seed, ERROR, error=message)
 
 
 class _LenientRecorder:
@@ -218,18 +218,18 @@ class _RolloutWorker:
         make_recorder: RecorderFactory | None,
         lanes: int,
     ) -> None:
-        first = make_environment()
-        self._agent = make_agent(first)
-        others = range(1, lanes if isinstance(self._agent, Agents) else 1)
-        self._environments = [first, *(make_environment() for _ in others)]
+        environment = make_environment()
+        self._agent = make_agent(environment)
+        further_lanes = range(1, lanes if isinstance(self._agent, Agents) else 1)
+        self._environments = [environment, *(make_environment() for _ in further_lanes)]
         recorders = [None if make_recorder is None else _LenientRecorder(make_recorder()) for _ in self._environments]
-        self._stages = [Stage(*each) for each in zip(self._environments, recorders, strict=True)]
+        self._stages = [Stage(*pair) for pair in zip(self._environments, recorders, strict=True)]
 
     def attempt(self, item: tuple[Sequence[int], bool]) -> list[Result]:
         """Play the episodes of seeds, and record them if the second part of the item says so."""
         seeds, recorded = item
-        played = play(self._stages, in_lanes(self._agent), seeds, recorded, recorded)
-        return [result_of(seed, ended, self._environments[0].spec.control_hz) for seed, ended in played]
+        results = play(self._stages, in_lanes(self._agent), seeds, recorded, recorded)
+        return [result_of(seed, result, self._environments[0].spec.control_hz) for seed, result in results]
 
     def close(self) -> None:
         """Close the environments and the agent."""

@@ -73,7 +73,7 @@ class NearestDemonstration:
         self._seeds = np.array([entry.seed for entry in self._entries])
         rows = [store.rows(f"rgb_{camera}") for camera in spec.cameras]
         starts = [entry.span.start for entry in self._entries]
-        images = [[_subsampled(each[start : start + 1])[0] for each in rows] for start in starts]
+        images = [[_subsample(array[start : start + 1])[0] for array in rows] for start in starts]
         self._cameras, self._size = spec.cameras, store.spec.image_size
         self._images = np.array(images)  # (E, cameras, h, w, 3)
         self.info: dict[str, Any] = {}
@@ -83,7 +83,7 @@ class NearestDemonstration:
         """Start an episode; the demonstration is chosen at the first action."""
         self._actions: Array | None = None
         self._step = 0
-        self._others = self._seeds != seed  # a recording must not be its own memory
+        self._other_seeds = self._seeds != seed  # a recording must not be its own memory
 
     @property
     def looks(self) -> bool:
@@ -93,17 +93,17 @@ class NearestDemonstration:
     def act(self, observation: Observation) -> Array:
         """Return the next (D,) action of the demonstration."""
         if self._actions is None:
-            self._actions = np.array(self._executed[self._entries[self._nearest(observation)].span])
+            self._actions = np.array(self._executed[self._entries[self._nearest_index(observation)].span])
         action = self._actions[min(self._step, len(self._actions) - 1)]
         self._step += 1
         return np.asarray(action, np.float32)
 
-    def _nearest(self, observation: Observation) -> int:
-        images = [_subsampled(resize(observation.rgb[camera], self._size)) for camera in self._cameras]
-        seen = np.stack(images).astype(np.int16)
-        known = np.flatnonzero(self._others & (self._instructions == observation.instruction))
-        candidates = known if len(known) else np.flatnonzero(self._others)
-        distances = [np.abs(self._images[index] - seen).mean() for index in candidates]
+    def _nearest_index(self, observation: Observation) -> int:
+        images = [_subsample(resize(observation.rgb[camera], self._size)) for camera in self._cameras]
+        query = np.stack(images).astype(np.int16)
+        same_instruction = np.flatnonzero(self._other_seeds & (self._instructions == observation.instruction))
+        candidates = same_instruction if len(same_instruction) else np.flatnonzero(self._other_seeds)
+        distances = [np.abs(self._images[index] - query).mean() for index in candidates]
         return int(candidates[np.argmin(distances)])
 
 
@@ -123,6 +123,6 @@ def make_nearest(folder: Path, environment: Environment) -> NearestDemonstration
     return NearestDemonstration(folder, None, spec=environment.spec)
 
 
-def _subsampled(images: Array) -> Array:
+def _subsample(images: Array) -> Array:
     """Return every `STRIDE`th row and column of (…, H, W, 3) images."""
     return images[..., ::STRIDE, ::STRIDE, :]

@@ -21,19 +21,19 @@ def save_moving_picture(episode: Episode, path: Path) -> None:
 
     Long episodes play faster, so that every picture takes about five seconds.
     """
-    seen = [each for each in episode.observations if each.rgb]
-    if not seen:
+    observations = [observation for observation in episode.observations if observation.rgb]
+    if not observations:
         return
-    places = np.linspace(0, len(seen) - 1, min(FRAMES, len(seen))).round().astype(int)
-    first, *others = (_frame(seen[int(place)]) for place in places)
-    duration = [*[MILLISECONDS] * len(others), LAST_MILLISECONDS]
-    options = {"save_all": True, "append_images": others, "loop": 0, "quality": QUALITY, "method": EFFORT}
+    indices = np.linspace(0, len(observations) - 1, min(FRAMES, len(observations))).round().astype(int)
+    first_frame, *frames = (_frame(observations[int(index)]) for index in indices)
+    duration = [*[MILLISECONDS] * len(frames), LAST_MILLISECONDS]
+    options = {"save_all": True, "append_images": frames, "loop": 0, "quality": QUALITY, "method": EFFORT}
     with atomic_path(path) as draft:
-        first.save(draft, "WEBP", duration=duration, **options)
+        first_frame.save(draft, "WEBP", duration=duration, **options)
 
 
-def _frame(seen: Observation) -> Image.Image:
+def _frame(observation: Observation) -> Image.Image:
     """Return the images (H, W, 3) of all cameras side by side, at most `HEIGHT` high."""
-    frame = Image.fromarray(np.concatenate([*seen.rgb.values()], axis=1))
+    frame = Image.fromarray(np.concatenate([*observation.rgb.values()], axis=1))
     frame.thumbnail((frame.width, HEIGHT))
     return frame

@@ -65,9 +65,9 @@ def open_loop(agent: Agent, spec: Spec, episodes: Iterable[Episode], constant: A
     def by_recording(errors: Array) -> Array:
         """Return the (R, D) means of (E, D) errors over the episodes of every recording."""
         numbers = np.array(recordings)
-        return np.array([errors[numbers == each].mean(0) for each in dict.fromkeys(recordings)])
+        return np.array([errors[numbers == recording].mean(0) for recording in dict.fromkeys(recordings)])
 
-    errors = np.array([np.abs(acts - seen).mean(0) for acts, seen in zip(predicted, recorded, strict=True)])
+    errors = np.array([np.abs(output - label).mean(0) for output, label in zip(predicted, recorded, strict=True)])
     means, constants = by_recording(errors), np.array([np.abs(actions - constant).mean(0) for actions in recorded])
-    interval, still = mean_interval(means), by_recording(constants).mean(0)
-    return OpenLoop(spec, seeds, recorded, predicted, errors, means.mean(0), interval, still)
+    interval, constant_errors = mean_interval(means), by_recording(constants).mean(0)
+    return OpenLoop(spec, seeds, recorded, predicted, errors, means.mean(0), interval, constant_errors)

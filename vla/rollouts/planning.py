@@ -35,10 +35,10 @@ def power_for_bar(episodes: int, rate: float, bar: float) -> float:
     """Return the probability that Wilson's interval of a success rate excludes a bar, on the side of the true rate."""
     from scipy.stats import binom  # the import takes a second
 
-    won = np.arange(episodes + 1)
-    apart = (won / episodes - bar) * (1 if rate > bar else -1)
-    beside = apart > NORMAL_QUANTILE * sqrt(bar * (1 - bar) / episodes)  # then Wilson's interval excludes the bar
-    return float(binom.pmf(won, episodes, rate)[beside].sum())
+    successes = np.arange(episodes + 1)
+    distances = (successes / episodes - bar) * (1 if rate > bar else -1)
+    decisive = distances > NORMAL_QUANTILE * sqrt(bar * (1 - bar) / episodes)  # then Wilson's interval excludes the bar
+    return float(binom.pmf(successes, episodes, rate)[decisive].sum())
 
 
 def power_of_pairs(episodes: int, discordant: float, difference: float) -> float:
@@ -48,12 +48,12 @@ def power_of_pairs(episodes: int, discordant: float, difference: float) -> float
     """
     from scipy.stats import binom
 
-    differ, spread = episodes * discordant, FAR * sqrt(episodes * discordant) + FAR
-    counts = np.arange(max(0, int(differ - spread)), min(episodes, int(differ + spread)) + 1)
-    most = binom.ppf(LEVEL / 2, counts, 0.5)
-    most -= binom.cdf(most, counts, 0.5) > LEVEL / 2  # the largest number lost that is significant
-    against = (discordant - abs(difference)) / 2 / discordant
-    return float(binom.pmf(counts, episodes, discordant) @ binom.cdf(most, counts, against))
+    mean, spread = episodes * discordant, FAR * sqrt(episodes * discordant) + FAR
+    counts = np.arange(max(0, int(mean - spread)), min(episodes, int(mean + spread)) + 1)
+    limits = binom.ppf(LEVEL / 2, counts, 0.5)
+    limits -= binom.cdf(limits, counts, 0.5) > LEVEL / 2  # the largest number lost that is significant
+    loss_share = (discordant - abs(difference)) / 2 / discordant
+    return float(binom.pmf(counts, episodes, discordant) @ binom.cdf(limits, counts, loss_share))
 
 
 def power_of_samples(episodes: int, one: float, other: float) -> float:
@@ -61,18 +61,18 @@ def power_of_samples(episodes: int, one: float, other: float) -> float:
     from scipy.stats import binom
 
     one, other = sorted((one, other))
-    every = np.arange(episodes + 1)
-    ways = binom.logpmf(every, episodes, 0.5)  # and a constant, which cancels
-    first, second = (binom.pmf(every, episodes, rate) for rate in (one, other))
+    counts = np.arange(episodes + 1)
+    ways = binom.logpmf(counts, episodes, 0.5)  # and a constant, which cancels
+    first, second = (binom.pmf(counts, episodes, rate) for rate in (one, other))
     reach = FAR * sqrt(episodes * max(one * (1 - one), other * (1 - other))) + FAR
     low, high = max(0, int(episodes * one - reach)), min(episodes, int(episodes * other + reach))
-    found = 0.0
+    power = 0.0
     for total in range(2 * low, 2 * high + 1):
-        won = np.arange(max(low, total - high), min(high, total - low) + 1)  # by the better policy
-        likely = np.exp(ways[won] + ways[total - won] - np.logaddexp.reduce(ways[won] + ways[total - won]))
-        rejected = np.cumsum(likely[::-1])[::-1] <= LEVEL / 2  # as hypergeometric numbers, given the total
-        found += float(first[total - won[rejected]] @ second[won[rejected]])
-    return found
+        wins = np.arange(max(low, total - high), min(high, total - low) + 1)  # by the better policy
+        probabilities = np.exp(ways[wins] + ways[total - wins] - np.logaddexp.reduce(ways[wins] + ways[total - wins]))
+        rejected = np.cumsum(probabilities[::-1])[::-1] <= LEVEL / 2  # as hypergeometric numbers, given the total
+        power += float(first[total - wins[rejected]] @ second[wins[rejected]])
+    return power
 
 
 @dataclass(frozen=True)
@@ -94,21 +94,21 @@ def stopping(mean: float, one: float, zero: float, enough: float, fixed: int) ->
     """
     from scipy.stats import binom
 
-    observed = one + zero  # observations per episode
-    counts = np.arange(1, ceil(HORIZON * fixed * observed) + 11)  # of observations
+    rate = one + zero  # observations per episode
+    counts = np.arange(1, ceil(HORIZON * fixed * rate) + 11)  # of observations
     bounds = _largest_decisive(mean, counts), counts - _largest_decisive(1 - mean, counts)
-    ended, by_chance = _ends(bounds, one / observed), _ends(bounds, mean)
+    ends, chance_ends = _ends(bounds, one / rate), _ends(bounds, mean)
 
-    def decided(ended: Array, episodes: int) -> float:
+    def decided(ends: Array, episodes: int) -> float:
         """Return the share of evaluations in which the observations of so many episodes decide."""
-        return float(ended @ binom.sf(counts - 1, episodes, observed))
+        return float(ends @ binom.sf(counts - 1, episodes, rate))
 
-    most = episodes_needed(lambda episodes: decided(ended, episodes), enough) if ended.sum() > enough else None
+    most = episodes_needed(lambda episodes: decided(ends, episodes), enough) if ends.sum() > enough else None
     if most is None:
         return None
-    # Wald: of the episodes until the m-th observation, or `most`, the share `observed` are observations.
-    until = np.cumsum(binom.sf(counts - 1, most, observed)) / observed
-    return Stopping(most, float(ended @ until + (1 - ended.sum()) * most), decided(by_chance, most))
+    # Wald: of the episodes until the m-th observation, or `most`, the share `rate` are observations.
+    waits = np.cumsum(binom.sf(counts - 1, most, rate)) / rate
+    return Stopping(most, float(ends @ waits + (1 - ends.sum()) * most), decided(chance_ends, most))
 
 
 def _largest_decisive(mean: float, counts: Array) -> Array:
@@ -122,9 +122,9 @@ def _largest_decisive(mean: float, counts: Array) -> Array:
     while (high - low > 1).any():
         middle = np.maximum((low + high) // 2, 0)
         capital = betaln(middle + 0.5, counts - middle + 0.5) - betaln(0.5, 0.5)
-        beyond = capital - middle * log(mean) - (counts - middle) * log(1 - mean) >= log(1 / LEVEL)
+        decisive = capital - middle * log(mean) - (counts - middle) * log(1 - mean) >= log(1 / LEVEL)
         open_ = high - low > 1
-        low, high = np.where(beyond & open_, middle, low), np.where(beyond | ~open_, high, middle)
+        low, high = np.where(decisive & open_, middle, low), np.where(decisive | ~open_, high, middle)
     return low
 
 
@@ -133,14 +133,14 @@ def _ends(bounds: tuple[Array, Array], share: float) -> Array:
 
     `bounds` are the largest and the smallest numbers of ones that decide, for every n.
     """
-    undecided, ended = np.zeros(len(bounds[0]) + 2), np.zeros(len(bounds[0]))  # undecided: by the number of ones
+    undecided, ends = np.zeros(len(bounds[0]) + 2), np.zeros(len(bounds[0]))  # undecided: by the number of ones
     undecided[0], first, last = 1.0, 0, 0
     for place, (low, high) in enumerate(zip(*bounds, strict=True)):
-        won = share * undecided[first : last + 1]
-        undecided[first : last + 1] -= won
-        undecided[first + 1 : last + 2] += won
+        ones = share * undecided[first : last + 1]
+        undecided[first : last + 1] -= ones
+        undecided[first + 1 : last + 2] += ones
         for decisive in (slice(first, low + 1), slice(high, last + 2)):
-            ended[place] += undecided[decisive].sum()
+            ends[place] += undecided[decisive].sum()
             undecided[decisive] = 0
         first, last = max(low + 1, 0), min(last + 1, high - 1)
-    return ended
+    return ends

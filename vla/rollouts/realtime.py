@@ -42,9 +42,9 @@ class Network:
 
     def draw(self, random: np.random.Generator) -> tuple[float, bool]:
         """Return the time from an observation to its answer [s], and whether that is lost."""
-        late, lost = random.random(2)
+        share, lost = random.random(2)
         lost = bool(lost < self.loss)
-        return self.latency + self.jitter * (1.0 if lost else late), lost
+        return self.latency + self.jitter * (1.0 if lost else share), lost
 
 
 IDEAL = Network(latency=0.0, jitter=0.0, loss=0.0, ensemble=None)
@@ -76,27 +76,27 @@ class RealTime:
     def reset(self, seed: int) -> None:
         """Start an episode, once the policy is idle."""
         self._link.reset(seed)
-        self._schedule, self._step, self._observed = Schedule[Array](), 0, 0
+        self._schedule, self._step, self._sent_step = Schedule[Array](), 0, 0
         self._answer: Delayed | Future[Array] | None = None
-        self._last: Array | None = None
+        self._last_action: Array | None = None
 
     def act(self, observation: Observation) -> Array:
         """Return the action (D,) to execute now. Raises what the policy raises."""
-        first = self._last is None
+        first = self._last_action is None
         self._link.tick()
         self._take()
         execute = 1 if first or self._ensemble is not None else self._execute()
         if self._answer is None and self._schedule.wants_plan(self._step, execute):
-            self._answer, self._observed = self._link.send(self._running(observation), first), self._step
+            self._answer, self._sent_step = self._link.send(self._with_plan(observation), first), self._step
             self._take(wait=first)
         if actions := self._schedule.at(self._step):
             self._step += 1  # only now: while the arm holds, no action becomes obsolete
-            self._last = actions[-1] if self._ensemble is None else averaged(actions, self._ensemble)
-            return self._last
-        assert self._last is not None, "the first answer has actions"
-        return np.where(self._relative, 0, self._last).astype(np.float32)
+            self._last_action = actions[-1] if self._ensemble is None else averaged(actions, self._ensemble)
+            return self._last_action
+        assert self._last_action is not None, "the first answer has actions"
+        return np.where(self._relative, 0, self._last_action).astype(np.float32)
 
-    def _running(self, observation: Observation) -> Observation:
+    def _with_plan(self, observation: Observation) -> Observation:
         """Return the observation with the rest of the plan that is executed until the next one arrives."""
         rest = self._schedule.remaining(self._step)
         if not rest or self._ensemble is not None:
@@ -107,7 +107,7 @@ class RealTime:
         if self._answer is not None and (wait or self._answer.done()):
             answer, self._answer = self._answer, None
             if (actions := answer.result()) is not None:
-                self._schedule.add(list(actions), self._observed)
+                self._schedule.add(list(actions), self._sent_step)
 
 
 def averaged(actions: Sequence[Array], ensemble: float) -> Array:
@@ -171,27 +171,27 @@ class BackgroundLink:
         self._plan, self._period = plan, 1 / control_hz
         self._thread = ThreadPoolExecutor(1, "policy")
         self.delays = Delays(self._period)
-        self._next = 0.0  # when the next control step begins
+        self._next_time = 0.0  # when the next control step begins
 
     def reset(self, seed: int) -> None:
         """Start an episode once the policy is idle."""
         self._thread.submit(int).result()  # after what was submitted before
-        self._next = 0.0
+        self._next_time = 0.0
 
     def tick(self) -> None:
         """Wait for the next control step."""
         now = time.monotonic()
-        time.sleep(max(0.0, self._next - now))
-        self._next = max(now, self._next) + self._period
+        time.sleep(max(0.0, self._next_time - now))
+        self._next_time = max(now, self._next_time) + self._period
 
     def send(self, observation: Observation, first: bool) -> Future[Array]:
         """Let the thread plan."""
-        return self._thread.submit(self._timed, observation)
+        return self._thread.submit(self._time_plan, observation)
 
-    def _timed(self, observation: Observation) -> Array:
-        began = time.monotonic()
+    def _time_plan(self, observation: Observation) -> Array:
+        start = time.monotonic()
         actions = self._plan(observation)
-        self.delays.add(time.monotonic() - began)
+        self.delays.add(time.monotonic() - start)
         return actions
 
     def close(self) -> None:

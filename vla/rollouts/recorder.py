@@ -44,7 +44,7 @@ class RerunRecorder:
         """
         self._folder, self._pictures = Path(folder), pictures
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._pictured = Counter[str]()  # outcome → number of moving pictures
+        self._picture_counts = Counter[str]()  # outcome → number of moving pictures
 
     def start(self, environment: Environment) -> None:
         """Begin an episode; an unfinished one is discarded."""
@@ -87,8 +87,8 @@ class RerunRecorder:
         rerun_bindings.flush_and_cleanup_orphaned_recordings()  # else its threads and memory leak
         with atomic_path(self._folder / f"{name}.rrd") as draft:
             draft.write_bytes(recording)
-        self._pictured[episode.outcome] += 1
-        if self._pictured[episode.outcome] <= self._pictures:
+        self._picture_counts[episode.outcome] += 1
+        if self._picture_counts[episode.outcome] <= self._pictures:
             save_moving_picture(episode, self._folder / f"{name}.webp")
 
     def _pose(self) -> None:
@@ -109,12 +109,12 @@ class _Writer:
         self._stream.send_recording_name(f"{episode.outcome}: {episode.instruction}")
         self._stream.send_property("episode", rr.AnyValues(outcome=episode.outcome, seed=episode.seed, steps=steps))
         end = f"{'✔' if episode.success else '✘'} **{episode.outcome}** after {steps} steps, seed {episode.seed}"
-        draws = "\n".join(f"- **{axis}** {_said(draw)}" for axis, draw in episode.draws.items())
-        said = [seen.instruction for seen in episode.observations]
-        given = [step for step in range(steps) if step == 0 or said[step] != said[step - 1]]
-        texts = [f"### {said[step]}\n\n{end}" for step in given]
+        draws = "\n".join(f"- **{axis}** {_format_draw(draw)}" for axis, draw in episode.draws.items())
+        instructions = [observation.instruction for observation in episode.observations]
+        starts = [step for step in range(steps) if step == 0 or instructions[step] != instructions[step - 1]]
+        texts = [f"### {instructions[step]}\n\n{end}" for step in starts]
         columns = rr.TextDocument.columns(text=texts, media_type=["text/markdown"] * len(texts))
-        self._columns("instruction", np.array(given), columns)
+        self._columns("instruction", np.array(starts), columns)
         self._static("draws", rr.TextDocument(draws, media_type="text/markdown"))
 
     def events(self, events: Sequence[tuple[int, str]]) -> None:
@@ -127,46 +127,46 @@ class _Writer:
         """Write body poses at the steps where they change: for many bodies, never."""
         for body in poses[0]:
             track = np.stack([pose[body] for pose in poses])  # (N + 1, 7)
-            moved = np.flatnonzero(np.append(True, (track[1:] != track[:-1]).any(axis=1)))
-            columns = rr.Transform3D.columns(translation=track[moved, :3], quaternion=_xyzw(track[moved, 3:]))
-            self._columns(_path("world", body), moved, columns)
+            steps = np.flatnonzero(np.append(True, (track[1:] != track[:-1]).any(axis=1)))
+            columns = rr.Transform3D.columns(translation=track[steps, :3], quaternion=_xyzw(track[steps, 3:]))
+            self._columns(_path("world", body), steps, columns)
 
     def cameras(self, observations: Sequence[Observation]) -> None:
         """Write colour as JPEG; depth [mm] as it is, which Rerun compresses faster and better than PNG would."""
         steps = np.arange(len(observations))
         for camera in observations[0].rgb:
-            blobs = [encode(seen.rgb[camera], "jpeg", quality=90) for seen in observations]
+            blobs = [encode(observation.rgb[camera], "jpeg", quality=90) for observation in observations]
             columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
             self._columns(_path("camera", camera, "rgb"), steps, columns)
         for camera in observations[0].depth:
-            depth = np.stack([seen.depth[camera] for seen in observations])
-            some = depth[::8]
-            shades = np.percentile(some[some > 0], (1, 90)) if some.any() else (0.0, 1.0)
+            depth = np.stack([observation.depth[camera] for observation in observations])
+            sample = depth[::8]
+            shades = np.percentile(sample[sample > 0], (1, 90)) if sample.any() else (0.0, 1.0)
             self._shades(_path("camera", camera, "depth"), steps, depth, "turbo", shades, meter=1000.0)
 
     def curves(self, episode: Episode) -> None:
         """Write state and executed action by unit, and the clean action if it differs."""
-        spec, state = self._spec, np.stack([seen.state for seen in episode.observations])
-        for unit, which in _by_unit(spec.state_units).items():
-            self._series(_path("state", unit), state[:, which], [spec.state[index] for index in which])
-        for unit, which in _by_unit(spec.units).items():
-            names = [spec.action[index] for index in which]
-            self._series(_path("action", unit, "executed"), episode.executed[:, which], names)
+        spec, state = self._spec, np.stack([observation.state for observation in episode.observations])
+        for unit, indices in _by_unit(spec.state_units).items():
+            self._series(_path("state", unit), state[:, indices], [spec.state[index] for index in indices])
+        for unit, indices in _by_unit(spec.units).items():
+            names = [spec.action[index] for index in indices]
+            self._series(_path("action", unit, "executed"), episode.executed[:, indices], names)
             if not np.array_equal(episode.actions, episode.executed):
                 names = [f"{name}, clean" for name in names]
-                self._series(_path("action", unit, "clean"), episode.actions[:, which], names, width=0.75)
+                self._series(_path("action", unit, "clean"), episode.actions[:, indices], names, width=0.75)
 
     def tokens(self, steps: Array, probabilities: Array) -> None:
         """Write the probabilities (N, D, K) of steps (N,) as images: a row per component, scaled by its maximum."""
         components, bins = probabilities.shape[1:]
-        row, first = TOKENS[0] // components, np.arange(TOKENS[1]) * bins // TOKENS[1]  # [px], bin of each column
+        row, edges = TOKENS[0] // components, np.arange(TOKENS[1]) * bins // TOKENS[1]  # [px], bin of each column
         # The square root makes small probabilities visible.
-        strength = np.maximum.reduceat(np.sqrt(probabilities / probabilities.max(axis=2, keepdims=True)), first, axis=2)
+        strength = np.maximum.reduceat(np.sqrt(probabilities / probabilities.max(axis=2, keepdims=True)), edges, axis=2)
         pixels = np.round(strength * 255).astype(np.uint8).repeat(row, axis=1)
         pixels[:, ::row] = 0  # a line between rows
         self._shades("tokens", steps, pixels, "inferno", (0.0, 255.0))
-        beside = [(-11.0, (index + 0.5) * row) for index in range(components)]
-        self._static("tokens/names", rr.Points2D(beside, labels=self._spec.action, radii=0.0, show_labels=True))
+        places = [(-11.0, (index + 0.5) * row) for index in range(components)]
+        self._static("tokens/names", rr.Points2D(places, labels=self._spec.action, radii=0.0, show_labels=True))
 
     def _shades(self, path: str, steps: Array, pixels: Array, colours: Any, ends: Any, **fields: float) -> None:
         """Write integer images (N, H, W) in a colour map that ranges over the two values `ends`.
@@ -187,8 +187,8 @@ class _Writer:
         columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition([count] * len(values))
         self._columns(path, np.arange(len(values)), columns)
 
-    def _static(self, path: str, *what: Any) -> None:
-        self._stream.log(path, *what, static=True)
+    def _static(self, path: str, *parts: Any) -> None:
+        self._stream.log(path, *parts, static=True)
 
     def _columns(self, path: str, steps: Array, columns: Iterable[Any]) -> None:
         seconds = rr.TimeColumn("time", duration=steps / self._spec.control_hz)
@@ -208,13 +208,13 @@ def _by_unit(units: Sequence[str]) -> dict[str, list[int]]:
     return {unit: [index for index, other in enumerate(units) if other == unit] for unit in dict.fromkeys(units)}
 
 
-def _said(drawn: Any) -> str:
+def _format_draw(draw: Any) -> str:
     """Format a draw, which is plain data, for people: floats with three digits."""
-    if isinstance(drawn, Mapping):
-        return ", ".join(f"{name} {_said(value)}" for name, value in drawn.items())
-    if isinstance(drawn, (list, tuple)):
-        return " ".join(map(_said, drawn))
-    return f"{drawn:.3g}" if isinstance(drawn, float) else str(drawn)
+    if isinstance(draw, Mapping):
+        return ", ".join(f"{name} {_format_draw(value)}" for name, value in draw.items())
+    if isinstance(draw, (list, tuple)):
+        return " ".join(map(_format_draw, draw))
+    return f"{draw:.3g}" if isinstance(draw, float) else str(draw)
 
 
 def _path(*parts: str) -> str:
@@ -264,15 +264,13 @@ def _blueprint(spec: Spec, tokens: bool, events: bool, viewpoint: tuple[Point, P
     if tokens:
         bounds = rrb.VisualBounds2D(x_range=(-22, TOKENS[1] + 1), y_range=(-2, TOKENS[0] + 2))
         plots.append(rrb.Spatial2DView(origin="/tokens", name="token probabilities", visual_bounds=bounds))
-    above: Any = rrb.Vertical(
-        rrb.Horizontal(*texts), rrb.Grid(*views, grid_columns=len(spec.cameras)), row_shares=[1, 3]
-    )
+    top: Any = rrb.Vertical(rrb.Horizontal(*texts), rrb.Grid(*views, grid_columns=len(spec.cameras)), row_shares=[1, 3])
     if viewpoint is not None:
         controls = rrb.EyeControls3D(position=viewpoint[0], look_target=viewpoint[1], eye_up=(0, 0, 1))
         scene = rrb.Spatial3DView(origin="/world", name="scene", eye_controls=controls, line_grid=False)
-        above = rrb.Horizontal(scene, above, column_shares=[5, 4])
+        top = rrb.Horizontal(scene, top, column_shares=[5, 4])
     return rrb.Blueprint(
-        rrb.Vertical(above, rrb.Horizontal(rrb.Tabs(*states), *plots), row_shares=[5, 3]),
+        rrb.Vertical(top, rrb.Horizontal(rrb.Tabs(*states), *plots), row_shares=[5, 3]),
         rrb.TimePanel(state="collapsed", timeline="step", fps=spec.control_hz),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -282,16 +280,16 @@ def _blueprint(spec: Spec, tokens: bool, events: bool, viewpoint: tuple[Point, P
 def _send_blueprint(stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
     """Do as `stream.send_blueprint(blueprint, make_active=False)`, which never frees the stream of the blueprint."""
     native = rerun_bindings.new_blueprint("vla", make_default=False, make_thread_default=False)
-    own = rr.RecordingStream._from_native(native)
-    own.set_time("blueprint", sequence=0)
-    blueprint._log_to_stream(own)
-    rerun_bindings.send_blueprint(own.memory_recording().storage, False, True, recording=stream.to_native())
-    own.disconnect()
+    layout_stream = rr.RecordingStream._from_native(native)
+    layout_stream.set_time("blueprint", sequence=0)
+    blueprint._log_to_stream(layout_stream)
+    rerun_bindings.send_blueprint(layout_stream.memory_recording().storage, False, True, recording=stream.to_native())
+    layout_stream.disconnect()
 
 
-def _curves(what: str, units: Sequence[str]) -> list[rrb.TimeSeriesView]:
+def _curves(kind: str, units: Sequence[str]) -> list[rrb.TimeSeriesView]:
     """Return one view per unit."""
-    return [rrb.TimeSeriesView(origin=_path(what, unit), name=f"{what} [{unit}]") for unit in _by_unit(units)]
+    return [rrb.TimeSeriesView(origin=_path(kind, unit), name=f"{kind} [{unit}]") for unit in _by_unit(units)]
 
 
 def merge(files: Sequence[Path], target: Path) -> None:
@@ -303,7 +301,7 @@ def merge(files: Sequence[Path], target: Path) -> None:
         raise UserError(f"no recordings to merge into {target}")
     with atomic_path(target) as draft:
         command = [VIEWER, "rrd", "merge", *map(str, files), "-o", str(draft)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            reason = done.stderr[-500:].strip()
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        if result.returncode:
+            reason = result.stderr[-500:].strip()
             raise UserError(f"rerun could not merge {counted(len(files), 'recording')} into {target}: {reason}")

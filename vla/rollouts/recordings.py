@@ -26,8 +26,8 @@ SUFFIXES = (".rrd", ".webp")  # of a recording and of a moving picture
 
 def chosen(report: Report, wanted: Recordings) -> list[Result]:
     """Return the episodes whose recordings are `wanted`: failures first, in the order of their seeds."""
-    ended = sorted((result for result in report.results if result.outcome != ERROR), key=lambda result: result.seed)
-    failures, successes = ([each for each in ended if each.success == good] for good in (False, True))
+    results = sorted((result for result in report.results if result.outcome != ERROR), key=lambda result: result.seed)
+    failures, successes = ([result for result in results if result.success == good] for good in (False, True))
     if wanted == "failures":
         return failures + successes[:SUCCESSES]
     return (failures + successes)[: None if wanted == "all" else wanted]
@@ -35,12 +35,12 @@ def chosen(report: Report, wanted: Recordings) -> list[Result]:
 
 def shown(episodes: Iterable[Result], failures: int = FAILURES_SHOWN, successes: int = SUCCESSES_SHOWN) -> list[Result]:
     """Return the first failures, then the first successes; failures cycle through the outcomes."""
-    earlier, places = Counter[str](), list[tuple[int, Result]]()
-    for each in sorted(episodes, key=lambda each: each.seed):
-        places.append((earlier[each.outcome], each))
-        earlier[each.outcome] += 1
-    ordered = [each for _, each in sorted(places, key=lambda place: place[0])]
-    failed, succeeded = ([each for each in ordered if each.success == good] for good in (False, True))
+    counts, places = Counter[str](), list[tuple[int, Result]]()
+    for result in sorted(episodes, key=lambda result: result.seed):
+        places.append((counts[result.outcome], result))
+        counts[result.outcome] += 1
+    results = [result for _, result in sorted(places, key=lambda place: place[0])]
+    failed, succeeded = ([result for result in results if result.success == good] for good in (False, True))
     return failed[:failures] + succeeded[:successes]
 
 
@@ -64,25 +64,25 @@ def merge_recordings(report: Report, folder: Path, target: Path, wanted: Recordi
     """
     from vla.rollouts.recorder import merge  # imports the viewer's library
 
-    names = {each.seed: recording_name(each.seed, each.outcome) for each in chosen(report, wanted)}
+    names = {result.seed: recording_name(result.seed, result.outcome) for result in chosen(report, wanted)}
     files = {seed: folder / f"{name}.rrd" for seed, name in names.items()}
-    there = [seed for seed, file in files.items() if file.exists()]
-    sizes = accumulate(files[seed].stat().st_size for seed in there)
-    recorded = there[: max(1, min(MOST, bisect_right([*sizes], LARGEST)))]
-    if recorded:
-        merge([files[seed] for seed in recorded], target)
-    if single := len(there) - len(recorded):
-        log.info("%s has %d recordings, the %d others stay in %s", target, len(recorded), single, folder)
-    return recorded
+    seeds = [seed for seed, file in files.items() if file.exists()]
+    sizes = accumulate(files[seed].stat().st_size for seed in seeds)
+    merged = seeds[: max(1, min(MOST, bisect_right([*sizes], LARGEST)))]
+    if merged:
+        merge([files[seed] for seed in merged], target)
+    if rest := len(seeds) - len(merged):
+        log.info("%s has %d recordings, the %d others stay in %s", target, len(merged), rest, folder)
+    return merged
 
 
 def keep_pictures(report: Report, folder: Path, wanted: Recordings, merged: Container[int]) -> None:
     """Keep the recordings of `wanted` episodes that were not `merged`, and the moving pictures to be `shown`; remove
     all others, and the folder if it is then empty."""
-    wanted_ones = chosen(report, wanted)
-    pictures = pictured(wanted_ones, folder)
-    kept = {pictures[each.seed] for each in shown(each for each in wanted_ones if each.seed in pictures)}
-    single = (each for each in wanted_ones if each.seed not in merged)
-    clear(folder, kept | {folder / f"{recording_name(each.seed, each.outcome)}.rrd" for each in single})
+    results = chosen(report, wanted)
+    pictures = pictured(results, folder)
+    paths = {pictures[result.seed] for result in shown(result for result in results if result.seed in pictures)}
+    unmerged = (result for result in results if result.seed not in merged)
+    clear(folder, paths | {folder / f"{recording_name(result.seed, result.outcome)}.rrd" for result in unmerged})
     with suppress(OSError):
         folder.rmdir()

@@ -88,25 +88,25 @@ class RemotePolicy:
                 f"agent.images has no key for the world's cameras, {', '.join(cameras)}: add "
                 f"+agent.images.{cameras[0]}=KEY"
             )
-        drawn, wanted = self.spec.image_size, self.image_size or self.spec.image_size
-        if drawn[0] < wanted[0] and drawn[1] < wanted[1]:
+        world_size, server_size = self.spec.image_size, self.image_size or self.spec.image_size
+        if world_size[0] < server_size[0] and world_size[1] < server_size[1]:
             text = "images of %d x %d px are enlarged to the %d x %d px of agent.image_size: set task.image_size"
-            log.warning(text, *drawn, *wanted)
+            log.warning(text, *world_size, *server_size)
         names = {name for names in self.state.values() for name in names or ()}
         if unknown := sorted(names - {*self.spec.state}):
-            known = ", ".join(self.spec.state)
-            raise UserError(f"agent.state names {', '.join(unknown)}, which the world's state lacks: it has {known}")
+            state = ", ".join(self.spec.state)
+            raise UserError(f"agent.state names {', '.join(unknown)}, which the world's state lacks: it has {state}")
         if self.actions is not None and sorted(self.actions) != sorted(self.spec.action):
             raise UserError(f"agent.actions must map {', '.join(self.spec.action)}, got {', '.join(self.actions)}")
         self.info: dict[str, Any] = {}
         self._broken, self._warned, self._configured_execute = False, False, self.execute
         self._low, self._high = np.array(self.spec.low, np.float32), np.array(self.spec.high, np.float32)
-        with ExitStack() as opened:
-            self._connection = opened.enter_context(closing(Connection(self.url, self.timeout, self.api_key)))
+        with ExitStack() as stack:
+            self._connection = stack.enter_context(closing(Connection(self.url, self.timeout, self.api_key)))
             self._adopt_metadata()
-            self._open = opened.pop_all()
+            self._resources = stack.pop_all()
         if self.asynchronous:
-            link = self._open.enter_context(closing(BackgroundLink(self.plan, self.spec.control_hz)))
+            link = self._resources.enter_context(closing(BackgroundLink(self.plan, self.spec.control_hz)))
         else:
             link = SimulatedLink(self.plan, IDEAL, self.spec.control_hz)
         self._real_time = RealTime(self.spec, link, lambda: self.execute or 1, self.ensemble)
@@ -121,18 +121,18 @@ class RemotePolicy:
         action, rate = self.metadata.get("action"), self.metadata.get("control_hz")
         names = action.get("names") if isinstance(action, dict) else None
         if self.actions is None and isinstance(names, list) and names != list(self.spec.action):
-            theirs, ours = ", ".join(map(str, names)), ", ".join(self.spec.action)
-            raise self._connection.error(f"its actions are {theirs[:200]}, the world's {ours[:200]}: set agent.actions")
+            peer, world = ", ".join(map(str, names)), ", ".join(self.spec.action)
+            raise self._connection.error(f"its actions are {peer[:200]}, the world's {world[:200]}: set agent.actions")
         if isinstance(rate, int | float) and abs(rate - self.spec.control_hz) > 0.01 * self.spec.control_hz:
             log.warning("%s acts at %g Hz, the world at %g Hz", self.url, rate, self.spec.control_hz)
-        advertised, history = (
+        execute, history = (
             number if isinstance(number := self.metadata.get(name), int) and number >= 1 else None
             for name in ("execute", "history")
         )
         self.history = history or 1  # frames of a window; above 1 every observation is sent
         # A running plan is returned to the server in its own actions, which a mapping cannot restore.
         self.chunking = self.metadata.get("chunking") is True and self.actions is None
-        self.execute = self._wanted = self._configured_execute or (1 if self.history > 1 else advertised)
+        self.execute = self._execute_limit = self._configured_execute or (1 if self.history > 1 else execute)
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode: drop all chunks, reconnect after an error, and notify a server that supports resets."""
@@ -154,11 +154,11 @@ class RemotePolicy:
 
     def plan(self, observation: Observation) -> Array:
         """Return the server's chunk, (k, D) float32, clipped; its first `execute` are executed. Raises as `act`."""
-        began = time.perf_counter()
+        start = time.perf_counter()
         answer = self._ask(self.message(observation))
-        self.info = {"answer_ms": 1000 * (time.perf_counter() - began)}
-        actions = self._translated(answer.get("actions"))
-        self.execute = min(self._wanted or len(actions), len(actions))
+        self.info = {"answer_ms": 1000 * (time.perf_counter() - start)}
+        actions = self._translate(answer.get("actions"))
+        self.execute = min(self._execute_limit or len(actions), len(actions))
         return actions
 
     def _ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
@@ -169,44 +169,44 @@ class RemotePolicy:
 
     def close(self) -> None:
         """Close the connection."""
-        self._open.close()
+        self._resources.close()
 
     def message(self, observation: Observation) -> dict[str, Any]:
         """Return the observation with the server's keys."""
-        sent: dict[str, Any] = {
+        content: dict[str, Any] = {
             key: observation.state if names is None else observation.state[self.spec.indices(names)]
             for key, names in self.state.items()
         }
-        sent[self.prompt] = observation.instruction
+        content[self.prompt] = observation.instruction
         if observation.running is not None and self.chunking:
-            sent["running"] = {"actions": observation.running.actions, "delay": observation.running.delay}
+            content["running"] = {"actions": observation.running.actions, "delay": observation.running.delay}
         for camera, key in self._images.items():
-            image = _resized(observation.rgb[camera], self.image_size)
-            *outer, name = [key] if isinstance(key, str) else key
-            place = sent
-            for each in outer:
-                place = place.setdefault(each, {})
-            place[name] = np.ascontiguousarray(image.transpose(2, 0, 1)) if self.channels_first else image
-        return sent
+            image = _resize(observation.rgb[camera], self.image_size)
+            *path, name = [key] if isinstance(key, str) else key
+            mapping = content
+            for part in path:
+                mapping = mapping.setdefault(part, {})
+            mapping[name] = np.ascontiguousarray(image.transpose(2, 0, 1)) if self.channels_first else image
+        return content
 
-    def _translated(self, actions: Any) -> Array:
+    def _translate(self, actions: Any) -> Array:
         """Convert the server's chunk to ours, (k, D)."""
         if not isinstance(actions, np.ndarray) or actions.ndim != 2 or 0 in actions.shape:
             shape = getattr(actions, "shape", type(actions).__name__)
             raise self._connection.error(f"its actions must be a chunk (k, D), got {shape}")
-        wanted = self.actions or {name: Component(index, 1.0, 0.0) for index, name in enumerate(self.spec.action)}
-        columns, width = [wanted[name] for name in self.spec.action], actions.shape[1]
-        if width <= max(each.index for each in columns) or (self.actions is None and width != len(columns)):
+        mapping = self.actions or {name: Component(index, 1.0, 0.0) for index, name in enumerate(self.spec.action)}
+        columns, width = [mapping[name] for name in self.spec.action], actions.shape[1]
+        if width <= max(column.index for column in columns) or (self.actions is None and width != len(columns)):
             names = ", ".join(self.spec.action)
             raise self._connection.error(f"its actions have {width} components, the world's {names}: set agent.actions")
-        mine = np.stack([each.scale * actions[:, each.index] + each.offset for each in columns], 1)
-        if not np.isfinite(mine).all():
+        unclipped = np.stack([column.scale * actions[:, column.index] + column.offset for column in columns], 1)
+        if not np.isfinite(unclipped).all():
             raise self._connection.error("an action is not finite")
-        clipped = np.clip(mine.astype(np.float32), self._low, self._high)
-        if not self._warned and (np.abs(mine - clipped) > self._high - self._low).any():
+        clipped = np.clip(unclipped.astype(np.float32), self._low, self._high)
+        if not self._warned and (np.abs(unclipped - clipped) > self._high - self._low).any():
             self._warned = True
-            where = f"actions of {self.url} are far beyond the bounds of the world"
-            log.warning("%s, to which they are clipped: convert their units with agent.actions", where)
+            problem = f"actions of {self.url} are far beyond the bounds of the world"
+            log.warning("%s, to which they are clipped: convert their units with agent.actions", problem)
         return clipped
 
 
@@ -235,9 +235,9 @@ class Connection:
         try:
             self.metadata = self._wait(self._connect())
         except InvalidStatus as error:
-            said = bytes(error.response.body or b"").decode(errors="replace").strip()[:200]
-            said = f"{said}: set VLA_API_KEY" if "API key" in said else said
-            raise self.error(said or f"HTTP status {error.response.status_code}") from error
+            body = bytes(error.response.body or b"").decode(errors="replace").strip()[:200]
+            body = f"{body}: set VLA_API_KEY" if "API key" in body else body
+            raise self.error(body or f"HTTP status {error.response.status_code}") from error
         except (OSError, WebSocketException) as error:  # a time-out is an OSError without a text
             reason = error if str(error) else f"no answer within {self.timeout:g} s"
             raise UserError(f"no policy server at {self.url} ({reason}): start it, or set agent.url") from error
@@ -245,11 +245,11 @@ class Connection:
     async def _connect(self) -> dict[str, Any]:
         await self._disconnect()
         try:
-            place = parse_uri(self.url)
+            uri = parse_uri(self.url)
             self._socket = await connect(
                 self.url,
-                host=place.host,  # where host and port are given, redirections elsewhere are refused
-                port=place.port,
+                host=uri.host,  # where host and port are given, redirections elsewhere are refused
+                port=uri.port,
                 proxy=None,  # ignore proxies of the environment
                 compression=None,
                 max_size=2**26,
@@ -262,13 +262,13 @@ class Connection:
             raise UserError(
                 f"agent.url={self.url[:200]} leads to no policy server ({error}): give one like ws://127.0.0.1:8000"
             ) from error
-        return await asyncio.wait_for(self._received(self._socket), self.timeout)
+        return await asyncio.wait_for(self._receive(self._socket), self.timeout)
 
     def ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
         """Return the answer to a message; raise a UserError if there is none."""
         assert self._socket is not None
         try:
-            return self._wait(asyncio.wait_for(self._asked(self._socket, pack(message)), self.timeout))
+            return self._wait(asyncio.wait_for(self._exchange(self._socket, pack(message)), self.timeout))
         except ConnectionClosed as error:
             reason = f" ({error.rcvd.reason})" if error.rcvd and error.rcvd.reason else ""
             raise self.error(f"it closed the connection{reason}") from error
@@ -276,11 +276,11 @@ class Connection:
             self._loop.call_soon_threadsafe(self._socket.transport.abort)  # a late answer would be taken for the next
             raise self.error(f"no answer within {self.timeout:g} s") from error
 
-    async def _asked(self, socket: ClientConnection, message: bytes) -> dict[str, Any]:
+    async def _exchange(self, socket: ClientConnection, message: bytes) -> dict[str, Any]:
         await socket.send(message)
-        return await self._received(socket)
+        return await self._receive(socket)
 
-    async def _received(self, socket: ClientConnection) -> dict[str, Any]:
+    async def _receive(self, socket: ClientConnection) -> dict[str, Any]:
         data = await socket.recv()
         if isinstance(data, str):
             raise self.error(data.strip().splitlines()[-1][:500] if data.strip() else "an empty error")
@@ -308,7 +308,7 @@ class Connection:
         self._loop.close()
 
 
-def _resized(image: Array, size: Sequence[int] | None) -> Array:
+def _resize(image: Array, size: Sequence[int] | None) -> Array:
     """Resize an (H, W, 3) image to `size` (height, width), with black borders where its aspect ratio differs."""
     if size is None or image.shape[:2] == tuple(size):
         return image

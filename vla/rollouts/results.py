@@ -129,13 +129,13 @@ class Report:
     @property
     def medians(self) -> dict[str, Median]:
         """Field of `Motion` → its median in successful episodes, without fields that were never measured."""
-        motions, found = [result.motion for result in self.results if result.success], dict[str, Median]()
+        motions, medians = [result.motion for result in self.results if result.success], dict[str, Median]()
         for name in AMOUNTS:
-            measured = [getattr(motion, name, None) for motion in motions]
-            if values := [value for value in measured if value is not None]:
+            amounts = [getattr(motion, name, None) for motion in motions]
+            if values := [value for value in amounts if value is not None]:
                 low, high = median_interval(values, self.anytime) or (None, None)
-                found[name] = Median(float(np.median(values)), low, high, len(values))
-        return found
+                medians[name] = Median(float(np.median(values)), low, high, len(values))
+        return medians
 
     @property
     def in_a_row(self) -> dict[str, int]:
@@ -145,7 +145,7 @@ class Report:
         """
         chains = [result.completed for result in self.results if result.completed]
         length = max((length for _, length in chains), default=0)
-        return {f"{n}/{length}": sum(done >= n for done, _ in chains) for n in range(1, length + 1)}
+        return {f"{n}/{length}": sum(count >= n for count, _ in chains) for n in range(1, length + 1)}
 
     @property
     def mean_in_a_row(self) -> Rate | None:
@@ -153,13 +153,13 @@ class Report:
         chains = [result.completed for result in self.results if result.completed]
         if not chains:
             return None
-        done, length = [done for done, _ in chains], max(length for _, length in chains)
+        counts, length = [count for count, _ in chains], max(length for _, length in chains)
         if self.anytime:  # conservative: bets on shares of successes gain less than bets on the values
-            share = sum(done) / length
-            low, high = (length * bound for bound in anytime_interval(share, len(done) - share))
+            share = sum(counts) / length
+            low, high = (length * bound for bound in anytime_interval(share, len(counts) - share))
         else:
-            low, high = bounded_mean_interval(done, length)
-        return sum(done) / len(done), low, high
+            low, high = bounded_mean_interval(counts, length)
+        return sum(counts) / len(counts), low, high
 
     @property
     def tasks(self) -> dict[str, Report]:
@@ -212,12 +212,12 @@ class Report:
     @staticmethod
     def _stratified(groups: Sequence[Mapping[str, Report]]) -> Rate:
         """Return the mean rate over groups of tasks, within which all episodes have equal weight."""
-        played = [[task for task in group.values() if task.episodes] for group in groups]
-        totals = [len(groups) * sum(task.episodes for task in tasks) for tasks in played]
+        strata = [[task for task in group.values() if task.episodes] for group in groups]
+        totals = [len(groups) * sum(task.episodes for task in tasks) for tasks in strata]
         return stratified_interval(
             [
                 (task.successes, task.episodes, task.episodes / total)
-                for tasks, total in zip(played, totals, strict=True)
+                for tasks, total in zip(strata, totals, strict=True)
                 for task in tasks
             ]
         )
@@ -225,10 +225,10 @@ class Report:
     @property
     def mean_label(self) -> str:
         """Name of `mean_over_tiers`, which says so if tasks of the tiers are missing from it."""
-        listed = {task for tasks in self.tiers.values() for task in tasks}
-        played = {result.task for result in self.results if result.outcome != ERROR}
-        known = sum(any(fnmatchcase(task, name) for task in played) for name in listed)
-        return "mean over tiers" if known == len(listed) else f"mean over tiers ({known} of {len(listed)} tasks)"
+        patterns = {task for tasks in self.tiers.values() for task in tasks}
+        played_tasks = {result.task for result in self.results if result.outcome != ERROR}
+        count = sum(any(fnmatchcase(task, pattern) for task in played_tasks) for pattern in patterns)
+        return "mean over tiers" if count == len(patterns) else f"mean over tiers ({count} of {len(patterns)} tasks)"
 
     def __str__(self) -> str:
         """Format failures, errors, motion, all rates and, last, the success rate with its interval."""
@@ -241,16 +241,16 @@ class Report:
             lines.append(f"medians of the successes, {ci}: {', '.join(medians)}")
         if row := self.mean_in_a_row:
             lines.append("completed in a row on average {:.2f} ({ci} {:.2f}-{:.2f})".format(*row, ci=ci))
-        rates = [each for kind in self.rates.values() for each in kind.items()]
-        lines += [f"{name.replace('_', ' ')} {_text(found, ci)}" for name, found in rates]
+        rates = [item for kind in self.rates.values() for item in kind.items()]
+        lines += [f"{name.replace('_', ' ')} {_text(counted, ci)}" for name, counted in rates]
         if mean := self.mean_over_tiers:
             rate, low, high = (100 * value for value in mean)
             lines.append(f"{self.mean_label} {rate:.1f} % ({ci} {low:.1f}-{high:.1f})")
         return "\n".join([*lines, f"success {_text(self.counted(), ci)}"])
 
 
-def _text(found: Counted, ci: str) -> str:
-    if not found.of:
+def _text(counted: Counted, ci: str) -> str:
+    if not counted.of:
         return "0/0 (no episode was completed)"
-    low, high = 100 * found.ci_low, 100 * found.ci_high
-    return f"{found.count}/{found.of} ({100 * found.rate:.1f} %, {ci} {low:.1f}-{high:.1f})"
+    low, high = 100 * counted.ci_low, 100 * counted.ci_high
+    return f"{counted.count}/{counted.of} ({100 * counted.rate:.1f} %, {ci} {low:.1f}-{high:.1f})"

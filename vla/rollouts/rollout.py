@@ -22,10 +22,10 @@ def rollout(
     Raises a UserError if an action has the wrong shape or is not finite, or the episode is over at its start.
     """
     stage = Stage(environment, recorder)
-    ((_, ended),) = play([stage], in_lanes(agent), [seed], recorder is not None, all_images)
-    if isinstance(ended, Exception):
-        raise ended
-    return ended
+    ((_, result),) = play([stage], in_lanes(agent), [seed], recorder is not None, all_images)
+    if isinstance(result, Exception):
+        raise result
+    return result
 
 
 class Replay(NamedTuple):
@@ -40,21 +40,21 @@ def replay(environment: Environment, episode: Episode, recorder: Recorder | None
     observation = environment.reset(episode.seed)
     if recorder is not None:
         recorder.start(environment)
-    same, seen = [], []
-    for recorded, action in zip(episode.observations, episode.executed, strict=True):
+    matches, observations = [], []
+    for reference, action in zip(episode.observations, episode.executed, strict=True):
         if environment.done:
             break
-        seen.append(copied(observation))
-        same.append(np.array_equal(seen[-1].state, recorded.state))
+        observations.append(copied(observation))
+        matches.append(np.array_equal(observations[-1].state, reference.state))
         if recorder is not None:
-            recorder.step(recorded, action, {})
+            recorder.step(reference, action, {})
         observation = environment.step(action)
     if recorder is not None:
         recorder.end(episode)
-    if not all(same):
-        return Replay(seen, same.index(False))
-    ended = len(same) == len(episode.executed) and environment.done and environment.outcome == episode.outcome
-    return Replay(seen, None if ended else len(same))
+    if not all(matches):
+        return Replay(observations, matches.index(False))
+    same_end = len(matches) == len(episode.executed) and environment.done and environment.outcome == episode.outcome
+    return Replay(observations, None if same_end else len(matches))
 
 
 def close_agent(agent: Agent) -> None:

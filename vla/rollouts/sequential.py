@@ -56,10 +56,10 @@ def anytime_interval(ones: float, zeros: float, halves: int = 0) -> tuple[float,
     An observation x between 0 and 1 may be counted as x ones and 1 - x zeros: by the inequality of arithmetic and
     geometric means, bets on it win at least as much.
     """
-    seen, limit = ones + zeros + halves, log(1 / LEVEL)
-    if seen == 0:
+    count, limit = ones + zeros + halves, log(1 / LEVEL)
+    if count == 0:
         return 0.0, 1.0
-    estimate = (ones + halves / 2) / seen
+    estimate = (ones + halves / 2) / count
 
     def bound(end: float) -> float:
         """Bisect between a capital below the limit, at the estimate, and one above; it is log-convex in the mean."""

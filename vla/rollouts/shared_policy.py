@@ -55,19 +55,19 @@ def shared_policy(make_policy: Callable[[], _Planner]) -> Iterator[Callable[[Env
     with one_thread_each(), Listener(family="AF_UNIX", authkey=(key := secrets.token_bytes(32))) as listener:
         policy, requests = make_policy(), queue.Queue[Request | None]()
         with (
-            ThreadPoolExecutor(1) as serving,
-            ExitStack() as at_last,
+            ThreadPoolExecutor(1) as server,
+            ExitStack() as cleanup,
             ThreadPoolExecutor(MOST) as talks,
-            ThreadPoolExecutor(1) as accepting,
+            ThreadPoolExecutor(1) as acceptor,
         ):
-            at_last.callback(requests.put, None)  # once all talks have ended: each waits for its answers
-            serving.submit(_serve, policy, requests)
-            accepting.submit(_accept, listener, partial(talks.submit, _talk, policy, requests))
+            cleanup.callback(requests.put, None)  # once all talks have ended: each waits for its answers
+            server.submit(_serve, policy, requests)
+            acceptor.submit(_accept, listener, partial(talks.submit, _talk, policy, requests))
             try:
                 yield partial(_DistantPolicy, str(listener.address), key)
             finally:
-                with suppress(OSError), Client(listener.address, authkey=key) as last:
-                    last.send(None)  # ends `_accept`, which would not notice that its socket is closed
+                with suppress(OSError), Client(listener.address, authkey=key) as client:
+                    client.send(None)  # ends `_accept`, which would not notice that its socket is closed
 
 
 def _accept(listener: Listener, begin: Callable[[int, Connection, Spec], Future[None]]) -> None:
@@ -84,15 +84,15 @@ def _accept(listener: Listener, begin: Callable[[int, Connection, Spec], Future[
 
 def _serve(policy: _Planner, requests: queue.Queue[Request | None]) -> None:
     """Answer requests until None arrives; those that wait at the same time share a call of the policy."""
-    while (first := requests.get()) is not None:
-        waiting = [first]
+    while (first_request := requests.get()) is not None:
+        batch = [first_request]
         with suppress(queue.Empty):
-            while (another := requests.get_nowait()) is not None:
-                waiting.append(another)
+            while (next_request := requests.get_nowait()) is not None:
+                batch.append(next_request)
             requests.put(None)
         for kind, call in (("reset", partial(_reset, policy)), ("act", policy.act), ("plan", policy.plan)):
-            if of_kind := [request for request in waiting if request.kind == kind]:
-                _answer(call, of_kind)
+            if group := [request for request in batch if request.kind == kind]:
+                _answer(call, group)
 
 
 def _reset(policy: _Planner, episodes: Sequence[tuple[str, int]], lanes: Sequence[int]) -> Sequence[None]:
@@ -127,8 +127,8 @@ def _talk(
                 content = (instruction, rest) if kind == "reset" else _observation(memory, spec, instruction, *rest)
                 requests.put(Request(kind, lane, content, answer := Future()))
                 error = answer.exception()
-                done = None if error else (answer.result(), policy.about(lane), policy.looking(lane))
-                connection.send(portable(error) if error else done)
+                reply = None if error else (answer.result(), policy.about(lane), policy.looking(lane))
+                connection.send(portable(error) if error else reply)
     finally:
         memory.close()
         memory.unlink()
@@ -193,8 +193,8 @@ class _DistantPolicy:
         for name, view in _views(self._memory, self._world).items():
             array = arrays.get(name, view)
             if (array.shape, array.dtype) != (view.shape, view.dtype):
-                expected, got = (f"{each.shape} {each.dtype}" for each in (view, array))
-                raise UserError(f"the world gives {name or 'a state'} of {got}, but its spec says {expected}")
+                expected, actual = (f"{side.shape} {side.dtype}" for side in (view, array))
+                raise UserError(f"the world gives {name or 'a state'} of {actual}, but its spec says {expected}")
             view[:] = array
         has_images = all(camera in arrays for camera in self._world.cameras)
         return self._ask(kind, observation.instruction, (has_images, observation.running))

@@ -52,32 +52,32 @@ class AgainstRun:
 
         It is valid after any number of episodes. Raises a UserError if equal seeds are different episodes.
         """
-        seen, pairs = self._paired(report, alike=False), pairs_of(self._paired(report))
-        if sum(pairs_of(seen)) and not sum(pairs):
+        same_seeds, pairs = self._pairs(report, alike=False), pairs_of(self._pairs(report))
+        if sum(pairs_of(same_seeds)) and not sum(pairs):
             self.require_common(())
         ended = bool(report.results) and report.results[-1].seed >= max(self.results)
         return ended or is_decided(pairs.first, pairs.second, sum(pairs), self.margin)
 
     def say(self, report: Report) -> str:
         """Describe the verdict on a finished report in one sentence."""
-        found = compare_pairs(pairs_of(self._paired(report)), self.anytime or report.anytime)
-        if not found.episodes:
+        test = compare_pairs(pairs_of(self._pairs(report)), self.anytime or report.anytime)
+        if not test.episodes:
             return f"no episode in common with {self.run}"
-        verdict = found.conclude(found.p, self.margin).verdict
-        difference, low, high = (f"{100 * share:+.1f}" for share in (found.difference, found.ci_low, found.ci_high))
+        verdict = test.conclude(test.p, self.margin).verdict
+        difference, low, high = (f"{100 * share:+.1f}" for share in (test.difference, test.ci_low, test.ci_high))
         return (
-            f"compared with {self.run} on {counted(found.episodes, 'common episode')}: {verdict}, {difference} points "
-            f"({low} to {high}), p = {found.p:.2g}"
+            f"compared with {self.run} on {counted(test.episodes, 'common episode')}: {verdict}, {difference} points "
+            f"({low} to {high}), p = {test.p:.2g}"
         )
 
-    def _paired(self, report: Report, alike: bool = True) -> Together:
+    def _pairs(self, report: Report, alike: bool = True) -> Together:
         """Return pairs of results, of the other run and of this one, with the same seed.
 
         `alike`: of the same episode only; under another goal or level of randomisation a seed gives another episode.
         """
-        pairs = [(self.results[mine.seed], mine) for mine in report.results if mine.seed in self.results]
-        same = [(one.instruction, one.draws) == (two.instruction, two.draws) for one, two in pairs]
-        return [pair for pair, equal in zip(pairs, same, strict=True) if equal or not alike]
+        pairs = [(self.results[result.seed], result) for result in report.results if result.seed in self.results]
+        matches = [(one.instruction, one.draws) == (two.instruction, two.draws) for one, two in pairs]
+        return [pair for pair, match in zip(pairs, matches, strict=True) if match or not alike]
 
 
 Statement = AgainstBar | AgainstRun

@@ -43,14 +43,14 @@ def stratified_interval(strata: Sequence[tuple[int, int, float]]) -> tuple[float
     """
     if not strata:
         return 0.0, 0.0, 1.0
-    won, trials, weights = np.array(strata, float).T
-    smooth = (won + 0.5) / (trials + 1)
+    successes, trials, weights = np.array(strata, float).T
+    smooth = (successes + 0.5) / (trials + 1)
     # With n trials the expectation of smooth * (1 - smooth) is (n^2 + n + 1) / (n + 1)^2 of p (1 - p) at p = 1/2.
-    unbiased = smooth * (1 - smooth) * np.square(trials + 1) / (np.square(trials) + trials + 1)
-    mean, variance = weights @ smooth, np.square(weights) @ (unbiased / trials)
-    effective = float(mean * (1 - mean) / variance)
-    rate = float(weights @ (won / trials))
-    return rate, *wilson_interval(rate * effective, effective)
+    variances = smooth * (1 - smooth) * np.square(trials + 1) / (np.square(trials) + trials + 1)
+    mean, variance = weights @ smooth, np.square(weights) @ (variances / trials)
+    effective_size = float(mean * (1 - mean) / variance)
+    rate = float(weights @ (successes / trials))
+    return rate, *wilson_interval(rate * effective_size, effective_size)
 
 
 def bounded_mean_interval(values: Sequence[float], largest: float) -> tuple[float, float]:
@@ -66,8 +66,8 @@ def bounded_mean_interval(values: Sequence[float], largest: float) -> tuple[floa
         return 0.0, largest
     smooth = (total + 0.5) / (count + 1)
     variance = (float(np.square(shares).sum()) + 0.5) / (count + 1) - smooth**2
-    effective = count * smooth * (1 - smooth) / variance
-    low, high = wilson_interval(total / count * effective, effective)
+    effective_size = count * smooth * (1 - smooth) / variance
+    low, high = wilson_interval(total / count * effective_size, effective_size)
     return largest * low, largest * high
 
 
@@ -77,10 +77,10 @@ def median_interval(values: Sequence[float] | Array, anytime: bool = False) -> t
     It contains the medians that the sign test does not exclude (W. R. Thompson, "On confidence ranges for the median
     and other expectation distributions", Annals of Mathematical Statistics 7, 1936).
     """
-    ordered, test = np.sort(values), anytime_p if anytime else mcnemar
-    count = len(ordered)
-    outside = bisect(range(count // 2 + 1), LEVEL, key=lambda below: test(below, count - below))
-    return (float(ordered[outside - 1]), float(ordered[-outside])) if outside else None
+    sorted_values, test = np.sort(values), anytime_p if anytime else mcnemar
+    count = len(sorted_values)
+    tail = bisect(range(count // 2 + 1), LEVEL, key=lambda below: test(below, count - below))
+    return (float(sorted_values[tail - 1]), float(sorted_values[-tail])) if tail else None
 
 
 def mcnemar(lost: int, won: int) -> float:
@@ -132,20 +132,20 @@ def effective_episodes(trainings: Sequence[Mapping[int, bool]]) -> tuple[float, 
     success = np.array([won for training in trainings for won in training.values()], float)
     if not len(success):
         return 0.0, 0.0
-    independent, rate = float(len(success)), float(success.mean())
+    episodes, rate = float(len(success)), float(success.mean())
     if len(trainings) > 1:
         scene = np.array([seed for training in trainings for seed in training])
         training = np.repeat(np.arange(len(trainings)), [len(training) for training in trainings])
-        apart = success - rate
-        between, within = _squares(apart, training) * len(trainings) / (len(trainings) - 1), _squares(apart, scene)
-        squares = max(between, within, between + within - float(apart @ apart))
+        excess = success - rate
+        by_run, by_scene = _squares(excess, training) * len(trainings) / (len(trainings) - 1), _squares(excess, scene)
+        squares = max(by_run, by_scene, by_run + by_scene - float(excess @ excess))
         variance = max(squares, 1e-9) / len(success) ** 2
-        effective = len(np.unique(scene)) if rate in (0, 1) else rate * (1 - rate) / variance
-        independent = min(independent, effective)
-    return rate * independent, independent
+        effective_size = len(np.unique(scene)) if rate in (0, 1) else rate * (1 - rate) / variance
+        episodes = min(episodes, effective_size)
+    return rate * episodes, episodes
 
 
 def _squares(values: Array, groups: Array) -> float:
     """Σ_g (Σ_{i∈g} x_i)²."""
-    _, place = np.unique(groups, return_inverse=True)
-    return float(np.square(np.bincount(place, values)).sum())
+    _, indices = np.unique(groups, return_inverse=True)
+    return float(np.square(np.bincount(indices, values)).sum())

@@ -28,16 +28,16 @@ class Stage:
 
     def reset(self, seed: int, recorded: bool = False) -> Observation:
         """Start the episode of a seed; raise a UserError if it is over at its start."""
-        self._now = self.environment.reset(seed)
+        self._observation = self.environment.reset(seed)
         if self.environment.done:
             raise UserError(f"the episode of seed {seed} is over at its start: `reset` must draw another one")
-        self._seed, self._seen, self._clean, self._executed = seed, list[Observation](), list[Array](), list[Array]()
+        self._seed, self._seen, self._labels, self._executed = seed, list[Observation](), list[Array](), list[Array]()
         # Read after the reset: the tool of a world may exist only from its first episode on.
         self._tool = [getattr(self.environment, "tool", None)]
         self._recording = self._recorder if recorded else None
         if self._recording is not None:
             self._recording.start(self.environment)
-        return self._now
+        return self._observation
 
     def step(self, action: Array, info: Mapping[str, Any], blind: bool) -> Observation | Episode:
         """Execute an action (D,); return the next observation, or the episode if it is over.
@@ -45,18 +45,18 @@ class Stage:
         The label for imitation is `info["clean"]` if present, else the action. What the agent drew, `info["draws"]`, is
         added to the draws of the environment.
         """
-        self._seen.append(copied(self._now))
-        self._clean.append(np.array(info.get("clean", action), dtype=np.float32))
+        self._seen.append(copied(self._observation))
+        self._labels.append(np.array(info.get("clean", action), dtype=np.float32))
         self._executed.append(action)
         if self._recording is not None:
-            self._recording.step(self._now, action, info)
+            self._recording.step(self._observation, action, info)
         with self.environment.blind() if blind else nullcontext():
-            self._now = self.environment.step(action)
+            self._observation = self.environment.step(action)
         if self._tool[0] is not None:
             self._tool.append(getattr(self.environment, "tool", None))
-        return self._ended(info) if self.environment.done else self._now
+        return self._end_episode(info) if self.environment.done else self._observation
 
-    def _ended(self, info: Mapping[str, Any]) -> Episode:
+    def _end_episode(self, info: Mapping[str, Any]) -> Episode:
         environment: Any = self.environment  # which may have instructions
         count = getattr(environment, "instructions", 1)
         episode = Episode(
@@ -67,7 +67,7 @@ class Stage:
             milestones=environment.milestones,
             draws={**environment.draws, **info.get("draws", {})},
             observations=self._seen,
-            actions=np.asarray(self._clean, dtype=np.float32),
+            actions=np.asarray(self._labels, dtype=np.float32),
             executed=np.asarray(self._executed, dtype=np.float32),
             completed=(environment.completed, count) if count > 1 else None,
             tool=None if self._tool[0] is None else np.array(self._tool),
@@ -77,7 +77,7 @@ class Stage:
         return episode
 
 
-class _Alone:
+class _SingleLane:
     """Adapter of an agent of one world to `Agents`, with a single lane."""
 
     def __init__(self, agent: Agent) -> None:
@@ -105,7 +105,7 @@ class _Alone:
 
 def in_lanes(agent: Agent | Agents) -> Agents:
     """Return an agent as `Agents`; an agent of one world gets a single lane."""
-    return agent if isinstance(agent, Agents) else _Alone(agent)
+    return agent if isinstance(agent, Agents) else _SingleLane(agent)
 
 
 @dataclass
@@ -132,75 +132,75 @@ def play(
     As long as there are any, a lane plays the seeds that equal its number modulo the number of lanes. The seed of an
     episode determines its row in the batch of a policy, so one pass then serves all lanes.
     """
-    waiting, playing = list(seeds), dict[int, _Episode]()
+    queue, episodes = list(seeds), dict[int, _Episode]()
     answers: dict[int, Any] = {}  # of the worlds: the next observation, the ended episode, or an error
-    while waiting or playing:
+    while queue or episodes:
         for lane, stage in enumerate(stages):
-            if waiting and lane not in playing:
-                fitting = next((seed for seed in waiting if seed % len(stages) == lane), waiting[0])
-                waiting.remove(fitting)
-                playing[lane] = _Episode(fitting, all_images=all_images)
-                answers[lane] = _tried(stage.reset, fitting, recorded)
-        arrived, answers = answers, {}
+            if queue and lane not in episodes:
+                next_seed = next((seed for seed in queue if seed % len(stages) == lane), queue[0])
+                queue.remove(next_seed)
+                episodes[lane] = _Episode(next_seed, all_images=all_images)
+                answers[lane] = _result_or_error(stage.reset, next_seed, recorded)
+        arrivals, answers = answers, {}
         observations: dict[int, Observation] = {}
-        ended: dict[int, Any] = {}
-        for lane, answer in arrived.items():
+        results: dict[int, Any] = {}
+        for lane, answer in arrivals.items():
             try:
                 if not isinstance(answer, Observation):
-                    ended[lane] = answer
-                elif _follows(agents, lane, playing[lane], answer):
+                    results[lane] = answer
+                elif _follow_instruction(agents, lane, episodes[lane], answer):
                     observations[lane] = answer
                 else:  # an image is missing: play it again
-                    playing[lane] = _Episode(playing[lane].seed, all_images=True)
-                    answers[lane] = _tried(stages[lane].reset, playing[lane].seed, recorded)
+                    episodes[lane] = _Episode(episodes[lane].seed, all_images=True)
+                    answers[lane] = _result_or_error(stages[lane].reset, episodes[lane].seed, recorded)
             except Exception as error:  # of any kind: agents are user code
-                ended[lane] = error
-        for lane, action in _acted(agents, observations, len(stages[0].environment.spec.action)).items():
+                results[lane] = error
+        for lane, action in _actions(agents, observations, len(stages[0].environment.spec.action)).items():
             if isinstance(action, Exception):
-                ended[lane] = action
+                results[lane] = action
                 continue
-            playing[lane].blind = not playing[lane].all_images and not agents.looking(lane)
-            answers[lane] = _tried(stages[lane].step, action, agents.about(lane), playing[lane].blind)
-        for lane, result in ended.items():
-            yield playing.pop(lane).seed, result
+            episodes[lane].blind = not episodes[lane].all_images and not agents.looking(lane)
+            answers[lane] = _result_or_error(stages[lane].step, action, agents.about(lane), episodes[lane].blind)
+        for lane, result in results.items():
+            yield episodes.pop(lane).seed, result
 
 
-def _tried(call: Callable[..., Any], *arguments: Any) -> Any:
+def _result_or_error(call: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return call(*arguments)
     except Exception as error:  # of any kind: worlds are user code
         return error
 
 
-def _follows(agents: Agents, lane: int, playing: _Episode, seen: Observation) -> bool:
+def _follow_instruction(agents: Agents, lane: int, episode: _Episode, observation: Observation) -> bool:
     """Reset the agent of a lane at a new instruction; return whether the image that it then reads was rendered."""
-    if seen.instruction == playing.instruction:
+    if observation.instruction == episode.instruction:
         return True
-    agents.reset(seen.instruction, playing.seed, lane)
-    playing.instruction = seen.instruction
-    return not (playing.blind and agents.looking(lane))
+    agents.reset(observation.instruction, episode.seed, lane)
+    episode.instruction = observation.instruction
+    return not (episode.blind and agents.looking(lane))
 
 
-def _acted(agents: Agents, seen: Mapping[int, Observation], components: int) -> dict[int, Array | Exception]:
+def _actions(agents: Agents, observations: Mapping[int, Observation], components: int) -> dict[int, Array | Exception]:
     """Return lane → its action (D,), or its error."""
-    if not seen:
+    if not observations:
         return {}
-    lanes = list(seen)
+    lanes = list(observations)
     try:
-        actions = agents.act([seen[lane] for lane in lanes], lanes)
+        actions = agents.act([observations[lane] for lane in lanes], lanes)
     except ValueError as error:
         if len(lanes) == 1:
             return {lanes[0]: error}
-        return {lane: _acted(agents, {lane: seen[lane]}, components)[lane] for lane in lanes}
+        return {lane: _actions(agents, {lane: observations[lane]}, components)[lane] for lane in lanes}
     except Exception as error:  # of any kind: agents are user code
         return dict.fromkeys(lanes, error)
-    acted: dict[int, Array | Exception] = {}
+    answers: dict[int, Array | Exception] = {}
     for lane, action in zip(lanes, actions, strict=True):
-        acted[lane] = action
+        answers[lane] = action
         if action.shape != (components,) or not np.isfinite(action).all():
-            name = type(agents.agent if isinstance(agents, _Alone) else agents).__name__
-            acted[lane] = UserError(f"{name} must return {components} finite numbers, got {action}")
-    return acted
+            name = type(agents.agent if isinstance(agents, _SingleLane) else agents).__name__
+            answers[lane] = UserError(f"{name} must return {components} finite numbers, got {action}")
+    return answers
 
 
 def copied(seen: Observation) -> Observation:

@@ -33,8 +33,8 @@ READ |= {f"evaluate.{name}": each.annotation for name, each in arguments(Evaluat
 def readable_config(config: Node) -> Node:
     """Return a config that reports can read; raise a UserError if a value that they use has the wrong type."""
     for key, kind in READ.items():
-        if (value := at(config, key)) != ABSENT and (wrong := mismatch(f"config.{key}", value, kind)):
-            raise UserError(wrong)
+        if (value := at(config, key)) != ABSENT and (problem := mismatch(f"config.{key}", value, kind)):
+            raise UserError(problem)
     return config
 
 
@@ -147,10 +147,10 @@ class ReportFile:
         if not self.seeds or len(set(self.seeds)) < len(self.seeds):
             raise UserError("seeds is empty, or has the same seed twice")
         for name, condition in self.conditions.items():
-            played = len(condition.outcomes)
-            if played > len(self.seeds) or (played < len(self.seeds) and not condition.anytime):
-                raise UserError(f"conditions.{name} has {played} outcomes of {len(self.seeds)} seeds")
-            if any(len(each) not in (0, played) for each in (condition.reached, condition.motions)):
+            count = len(condition.outcomes)
+            if count > len(self.seeds) or (count < len(self.seeds) and not condition.anytime):
+                raise UserError(f"conditions.{name} has {count} outcomes of {len(self.seeds)} seeds")
+            if any(len(column) not in (0, count) for column in (condition.reached, condition.motions)):
                 raise UserError(f"conditions.{name} has other episodes in reached or motions than in outcomes")
 
     @cached_property
@@ -159,5 +159,5 @@ class ReportFile:
         tiers = at(self.config, "task.tiers", None) or {}  # also with tasks that were not played
         # Without tiers a condition may change the task of an episode; in a benchmark the task follows from the seed.
         tasks = [result.task if tiers else "" for result in self.per_episode]
-        others = {name: part.report(self.seeds, tasks, tiers) for name, part in self.conditions.items()}
-        return {IN_DISTRIBUTION: Report(tuple(self.per_episode), tiers, self.anytime), **others}
+        conditions = {name: part.report(self.seeds, tasks, tiers) for name, part in self.conditions.items()}
+        return {IN_DISTRIBUTION: Report(tuple(self.per_episode), tiers, self.anytime), **conditions}

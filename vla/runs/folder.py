@@ -67,8 +67,8 @@ class Run:
     @property
     def parameters(self) -> int | None:
         """Number of the model's parameters, if known."""
-        known = self.training or self.report or self.errors
-        return known.parameters if known else None
+        source = self.training or self.report or self.errors
+        return source.parameters if source else None
 
     @property
     def reports(self) -> dict[str, Report]:
@@ -79,8 +79,8 @@ class Run:
 def read_run(folder: Path) -> Run:
     """Read a run's folder; every file is optional, and a UserError names one that is damaged."""
     report, errors = read_report(folder), _read(folder / ERRORS, partial(read_json, kind=ErrorsFile), None)
-    evaluated = report or errors
-    config = _read(folder / CONFIG, partial(read_yaml, kind=Node), evaluated.config if evaluated else {})
+    evaluation = report or errors
+    config = _read(folder / CONFIG, partial(read_yaml, kind=Node), evaluation.config if evaluation else {})
     changes = _read(folder / CHANGES, partial(read_yaml, kind=list[Change]), None)
     metrics: dict[str, Curve] = _read(folder / METRICS, _curves, {})
     return Run(folder, config, changes, read_training(folder), metrics, report, errors)
@@ -127,9 +127,9 @@ def save_training(folder: Path, training: Training) -> None:
     write_text(folder / TRAINING, json.dumps(asdict(training), ensure_ascii=False) + "\n")
 
 
-def _read(path: Path, read: Callable[[Path], T], otherwise: T) -> T:
+def _read(path: Path, read: Callable[[Path], T], default: T) -> T:
     if not path.is_file():
-        return otherwise
+        return default
     try:
         return read(path)
     except ValueError as error:
@@ -155,12 +155,12 @@ def metric_rows(path: Path) -> list[dict[str, str]]:
     require_file(path)
     with path.open("rb") as file:
         head = file.readline(LARGEST_METRICS)
-        if (skipped := path.stat().st_size - LARGEST_METRICS) > len(head):
+        if (offset := path.stat().st_size - LARGEST_METRICS) > len(head):
             log.warning("of %s, which has %d bytes, only the last rows are read", path, path.stat().st_size)
-            file.seek(skipped)
+            file.seek(offset)
             file.readline(LARGEST_METRICS)  # the rest of a row
         text = (head + file.read(LARGEST_METRICS)).decode("utf-8", "replace")
-    rows, found = csv.reader(io.StringIO(text, newline="")), []
+    rows, records = csv.reader(io.StringIO(text, newline="")), []
     try:
         names = next(rows, ["step"])
         if "step" not in names or len(set(names)) < len(names) or len(names) > MOST_METRICS:
@@ -170,7 +170,7 @@ def metric_rows(path: Path) -> list[dict[str, str]]:
                 numbers = {name: value for name, value in zip(names, row, strict=True) if value}
                 if not 0 <= int(numbers.get("step", -1)) < 2**31 or not [*map(float, numbers.values())]:
                     raise UserError(f"step must be a number from 0 to {2**31 - 1}, got {numbers.get('step')}")
-                found.append(numbers)
+                records.append(numbers)
     except (ValueError, csv.Error) as error:
         raise UserError(f"{path} is damaged in line {rows.line_num}: {str(error)[:200]}") from error
-    return found
+    return records

@@ -36,17 +36,17 @@ class Played:
         self._lock = locked(folder / LOCK, busy)
         self._path, lines = folder / PLAYED, [_line(head)]
         self.results = defaultdict[str, dict[int, Result]](dict)  # condition → seed → result
-        before = read_bounded(self._path, LARGEST).decode("utf-8", "replace") if self._path.is_file() else ""
-        if before.startswith(lines[0]):
-            for line in before.split("\n")[1:]:
+        text = read_bounded(self._path, LARGEST).decode("utf-8", "replace") if self._path.is_file() else ""
+        if text.startswith(lines[0]):
+            for line in text.split("\n")[1:]:
                 try:
                     condition, result = parse_json(line, cast(type[Episode], Episode), str(self._path))
                 except ValueError:  # the process was killed while it wrote this line, or the file ends
                     break
                 self.results[condition][result.seed] = result
                 lines.append(f"{line}\n")
-            if played := len(lines) - 1:
-                log.info("episodes already played: %d, in %s", played, self._path)
+            if count := len(lines) - 1:
+                log.info("episodes already played: %d, in %s", count, self._path)
         write_text(self._path, "".join(lines))
 
     def __enter__(self) -> Played:

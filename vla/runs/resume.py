@@ -32,27 +32,27 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | N
     The first result is the checkpoint of an unfinished training, or None. The second is the folder of the policy that a
     finished training selected, or None; it needs no checkpoint. Both are None before the first save.
     """
-    last, chosen = folder / CHECKPOINTS / LAST, folder / POLICY
+    last, policy_folder = folder / CHECKPOINTS / LAST, folder / POLICY
     if last.exists():
-        saved = read_header(last)
-    elif chosen.is_dir():
-        policy = read_policy(chosen)
-        saved = Header(policy.config, True, policy.training.steps)
+        header = read_header(last)
+    elif policy_folder.is_dir():
+        policy = read_policy(policy_folder)
+        header = Header(policy.config, True, policy.training.steps)
     else:
         return None, None
-    require_identity(saved.config, config, folder)
-    trainer, before = config["trainer"], saved.config.get("trainer", {})
-    changed = any(trainer.get(name) != before.get(name) for name in LENGTHS)
-    longer = changed and not 0 <= trainer["max_steps"] <= saved.steps
-    if changed and not longer and trainer["max_steps"] != saved.steps:
-        log.warning("%s was trained for %s, more than trainer.max_steps", folder, counted(saved.steps, "step"))
-    if saved.finished and chosen.is_dir() and not longer:
-        require_identity(read_policy(chosen).config, config, folder)  # which is what other jobs build
-        log.info("training is already finished: %s", chosen)
-        return None, chosen
+    require_identity(header.config, config, folder)
+    trainer, old_trainer = config["trainer"], header.config.get("trainer", {})
+    changed = any(trainer.get(name) != old_trainer.get(name) for name in LENGTHS)
+    longer = changed and not 0 <= trainer["max_steps"] <= header.steps
+    if changed and not longer and trainer["max_steps"] != header.steps:
+        log.warning("%s was trained for %s, more than trainer.max_steps", folder, counted(header.steps, "step"))
+    if header.finished and policy_folder.is_dir() and not longer:
+        require_identity(read_policy(policy_folder).config, config, folder)  # which is what other jobs build
+        log.info("training is already finished: %s", policy_folder)
+        return None, policy_folder
     if not last.exists():
         raise UserError(f"a longer training would continue from {last}, which is gone: choose another output=DIR")
-    if isinstance(trainer.get("strategy"), dict) and not isinstance(before.get("strategy"), dict):
+    if isinstance(trainer.get("strategy"), dict) and not isinstance(old_trainer.get("strategy"), dict):
         # A sharded optimiser orders its parameters differently.
         raise UserError(f"trainer=fsdp cannot continue {last}, which was trained without it: use trainer=ddp")
     log.info("resuming from %s", last)
@@ -67,8 +67,8 @@ def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path, we
         return None
     against, nearest = config["evaluate"]["against"], config["evaluate"]["nearest"]
     # Since then, the run to compare with may have been evaluated again, or more demonstrations collected.
-    newer = [*([Path(against) / REPORT] if against else []), *([Path(nearest) / INDEX] if nearest else [])]
-    if any(path.stat().st_mtime > (folder / REPORT).stat().st_mtime for path in newer):
+    sources = [*([Path(against) / REPORT] if against else []), *([Path(nearest) / INDEX] if nearest else [])]
+    if any(path.stat().st_mtime > (folder / REPORT).stat().st_mtime for path in sources):
         return None
     if any(part.errors for part in report.reports.values()) or differences(report.config, config):
         return None

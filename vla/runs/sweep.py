@@ -42,11 +42,11 @@ class SweepRow:
     @cached_property
     def played(self) -> dict[str, list[dict[int, bool]]]:
         """Condition → for every cell, seed → success; without errors."""
-        found: dict[str, list[dict[int, bool]]] = {}
-        for condition, report in (each for run in self.runs for each in run.reports.items()):
-            ended = {result.seed: result.success for result in report.results if result.outcome != ERROR}
-            found.setdefault(condition, []).append(ended)
-        return found
+        outcomes: dict[str, list[dict[int, bool]]] = {}
+        for condition, report in (item for run in self.runs for item in run.reports.items()):
+            successes = {result.seed: result.success for result in report.results if result.outcome != ERROR}
+            outcomes.setdefault(condition, []).append(successes)
+        return outcomes
 
     @property
     def episodes(self) -> dict[str, int]:
@@ -70,15 +70,15 @@ def conditions_of(rows: list[SweepRow]) -> list[str]:
 
 def read_rows(folder: Path) -> list[SweepRow]:
     """Read the rows of all cells that have a report and did not fail, in the order of the sweep."""
-    reported = [
+    evaluations = [
         (overrides_of(cell), read_run(cell))
         for cell in cells(folder, REPORT)
         if not (cell / FAILURE).exists()  # its report may be of other overrides
     ]
-    varied = [key for key in varied_keys([overrides for overrides, _ in reported]) if key != SEED]
+    keys = [key for key in varied_keys([overrides for overrides, _ in evaluations]) if key != SEED]
     rows: dict[tuple[str, ...], SweepRow] = {}
-    for overrides, run in reported:
-        choices = {key: overrides.get(key, "default") for key in varied}
+    for overrides, run in evaluations:
+        choices = {key: overrides.get(key, "default") for key in keys}
         rows.setdefault(tuple(choices.values()), SweepRow(choices)).runs.append(run)
     return list(rows.values())
 
@@ -90,17 +90,17 @@ def save_failure(cell: Path, reason: str) -> None:
 
 def describe_failures(folder: Path) -> str:
     """Return the number of failed cells of a sweep, and a line for each."""
-    failed, started = failures(folder), len(cells(folder, OVERRIDES))
-    return "\n  ".join([f"{len(failed)} of {started} cells failed, see {FAILURE} of each in {folder}", *failed])
+    lines, count = failures(folder), len(cells(folder, OVERRIDES))
+    return "\n  ".join([f"{len(lines)} of {count} cells failed, see {FAILURE} of each in {folder}", *lines])
 
 
 def failures(folder: Path) -> list[str]:
     """Describe the failed cells of a sweep: name, choices and reason of each."""
     choices_of = {cell: overrides_of(cell) for cell in cells(folder, OVERRIDES)}
-    varied = varied_keys(list(choices_of.values()))
+    keys = varied_keys(list(choices_of.values()))
     lines = []
     for cell in cells(folder, FAILURE):
-        choices = "".join(f" {key}={choices_of[cell][key]}" for key in varied if key in choices_of[cell])
+        choices = "".join(f" {key}={choices_of[cell][key]}" for key in keys if key in choices_of[cell])
         reason = read_bounded(cell / FAILURE).decode("utf-8", "replace").partition("\n")[0]
         lines.append(f"{cell.name}{choices}: {reason}")
     return lines
@@ -108,8 +108,8 @@ def failures(folder: Path) -> list[str]:
 
 def cells(folder: Path, having: str) -> list[Path]:
     """Return the cells that contain the file `having`, in the order of the sweep."""
-    found = [cell for cell in folder.iterdir() if (cell / having).exists()]
-    return sorted(found, key=lambda cell: (len(cell.name), cell.name))
+    folders = [cell for cell in folder.iterdir() if (cell / having).exists()]
+    return sorted(folders, key=lambda cell: (len(cell.name), cell.name))
 
 
 def overrides_of(cell: Path) -> dict[str, str]:

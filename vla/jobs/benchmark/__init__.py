@@ -31,21 +31,21 @@ def run(experiment: Experiment) -> dict[str, Measure]:
     """
     from vla.reports.tables import Table  # imports matplotlib
 
-    here, found, names = machine(), dict[str, Measure](), experiment.options(Benchmark).names
+    host, measures, names = machine(), dict[str, Measure](), experiment.options(Benchmark).names
     if "evaluate" in names and experiment.checkpoint is None:  # before the others, which take minutes
         raise UserError("benchmark.names=[evaluate] plays a trained policy: add checkpoint=RUN")
     for name in names:
-        stage, (others, began) = getattr(import_module(f"{__name__}.{MODULES.get(name, name)}"), name), other_load()
-        measured, (others_now, now) = stage(experiment), other_load()
-        used = max(0.0, others_now - others) / max(now - began, 1e-9)
-        found |= {key: {**each, "others": round(used, 2)} for key, each in measured.items()}
-        if used > BUSY * cores():
-            slower = "is slower here than on an idle machine, and its ratios are less exact"
-            log.warning("%s %s: other programs used %.1f cores meanwhile", name, slower, used)
+        stage, (start_load, start) = getattr(import_module(f"{__name__}.{MODULES.get(name, name)}"), name), other_load()
+        stage_measures, (end_load, end) = stage(experiment), other_load()
+        other_cores = max(0.0, end_load - start_load) / max(end - start, 1e-9)
+        measures |= {key: {**measure, "others": round(other_cores, 2)} for key, measure in stage_measures.items()}
+        if other_cores > BUSY * cores():
+            text = "is slower here than on an idle machine, and its ratios are less exact"
+            log.warning("%s %s: other programs used %.1f cores meanwhile", name, text, other_cores)
     file = experiment.output / "benchmark.json"
-    write_json(file, {"machine": here, "measures": found})
+    write_json(file, {"machine": host, "measures": measures})
     heads = ("stage", "value", "unit", "n", "floor", "ratio", "others [cores]")
-    rows = [[name, *map(str, each.values())] for name, each in found.items()]
-    show(Table(heads, rows, ", ".join(map(str, here.values()))))
+    rows = [[name, *map(str, measure.values())] for name, measure in measures.items()]
+    show(Table(heads, rows, ", ".join(map(str, host.values()))))
     log.info("wrote %s", file)
-    return found
+    return measures

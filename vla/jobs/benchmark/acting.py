@@ -38,26 +38,26 @@ def policy(experiment: Experiment) -> dict[str, Measure]:
     for _ in range(model.history + 1):  # warm-up: compiles and allocates
         agent.act(observation)
     frame = agent.frame(observation)
-    asked = experiment.options(Benchmark)
+    options = experiment.options(Benchmark)
     with torch.inference_mode():
-        kept = agent.window()
-        if asked.peer:
-            floor = partial(build({**asked.peer, "_partial_": False}, PEER, model=model), kept)
-            _require_equal(floor(), model.predict(kept).actions)
+        window = agent.window()
+        if options.peer:
+            floor = partial(build({**options.peer, "_partial_": False}, PEER, model=model), window)
+            _require_equal(floor(), model.predict(window).actions)
         else:
 
             def floor() -> object:
-                return model.encode(frame), model.predict(kept).actions.cpu()
+                return model.encode(frame), model.predict(window).actions.cpu()
 
-        times = np.array([[timed(partial(agent.plan, observation))[1], timed(floor)[1]] for _ in range(asked.steps)])
-    acting, network = 1000 * np.median(times, 0)
-    return {"policy": measure(acting, "ms", asked.steps, network)}
+        times = np.array([[timed(partial(agent.plan, observation))[1], timed(floor)[1]] for _ in range(options.steps)])
+    latency, network = 1000 * np.median(times, 0)
+    return {"policy": measure(latency, "ms", options.steps, network)}
 
 
-def _require_equal(theirs: Tensor, ours: Tensor) -> None:
-    off = float((theirs - ours).abs().max() / theirs.abs().max())
-    if not off <= EQUAL:
-        raise UserError(f"benchmark.peer plans other actions: they differ by {off:.1e} of the largest")
+def _require_equal(peer_actions: Tensor, actions: Tensor) -> None:
+    difference = float((peer_actions - actions).abs().max() / peer_actions.abs().max())
+    if not difference <= EQUAL:
+        raise UserError(f"benchmark.peer plans other actions: they differ by {difference:.1e} of the largest")
 
 
 def evaluate(experiment: Experiment) -> dict[str, Measure]:
@@ -65,7 +65,7 @@ def evaluate(experiment: Experiment) -> dict[str, Measure]:
     count, rates = experiment.options(Benchmark).episodes, []
     for recorder in (plain(compose().recorder), None):
         with TemporaryDirectory() as folder:
-            asked = {"job": "evaluate", "evaluate.episodes": count, "evaluate.recordings": "all"}
-            trial = experiment.with_values({**asked, "recorder": recorder, "output": folder})
+            values = {"job": "evaluate", "evaluate.episodes": count, "evaluate.recordings": "all"}
+            trial = experiment.with_values({**values, "recorder": recorder, "output": folder})
             rates.append(count / timed(partial(import_module("vla.jobs.evaluate").run, trial))[1])
     return {"evaluate": measure(rates[0], "episodes/s", count, rates[1])}

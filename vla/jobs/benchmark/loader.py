@@ -32,22 +32,22 @@ def loader(experiment: Experiment) -> dict[str, Measure]:
     """
     store = demonstrations(experiment)
     model = experiment.fitted_learner(store).model
-    alone = experiment.with_values({"collect.more": None})  # the floor reads one store
+    variant = experiment.with_values({"collect.more": None})  # the floor reads one store
     names = {"loader": model.history, "loader: 1 frame": 1, "loader: 6 frames": 6}
-    found = {name: _loading(alone, store, frames, model.chunk) for name, frames in names.items()}
+    measures = {name: _measure_loading(variant, store, frames, model.chunk) for name, frames in names.items()}
     if "image_size" in experiment["task"]:
-        found |= _of_large_images(alone.with_values({"task.image_size": [LARGE, LARGE]}), model.chunk)
-    return found
+        measures |= _measure_large_images(variant.with_values({"task.image_size": [LARGE, LARGE]}), model.chunk)
+    return measures
 
 
-def _of_large_images(experiment: Experiment, chunk: int) -> dict[str, Measure]:
-    environment, found = experiment.make_environment()(), dict[str, Measure]()
+def _measure_large_images(experiment: Experiment, chunk: int) -> dict[str, Measure]:
+    environment, measures = experiment.make_environment()(), dict[str, Measure]()
     expert = experiment.make_expert()(environment)
     seeds = range(experiment.options(Benchmark).episodes)
     episodes = [_from_three_cameras(rollout(environment, expert, seed)) for seed in seeds]
     environment.close()
     spec = replace(environment.spec, cameras=tuple(episodes[0].observations[0].rgb), depth=(), parts=())
-    every = experiment.with_values({"collect.episodes": len(seeds), "data.validation_fraction": 0})
+    variant = experiment.with_values({"collect.episodes": len(seeds), "data.validation_fraction": 0})
     for codec in (Codec.suited(spec), Codec("jpeg", experiment.collect.quality)):
         with TemporaryDirectory() as folder:
             store = EpisodeStore.create_or_open(folder, spec, {}, codec)
@@ -55,33 +55,33 @@ def _of_large_images(experiment: Experiment, chunk: int) -> dict[str, Measure]:
                 for episode in episodes:
                     store.append(episode)
             name, steps = f"loader: 3 x {LARGE} px, {codec.images}", store.episodes[-1].end
-            found[name] = _loading(every, store, 1, chunk)
+            measures[name] = _measure_loading(variant, store, 1, chunk)
             size = sum(store.size(field, entry) for field in store.fields for entry in store.episodes) / steps
             raw = sum(prod(shape) * dtype.itemsize for shape, dtype in store.fields.values())
-            of_many = measure(EPISODES * STEPS * size / 1e9, "GB", steps, EPISODES * STEPS * raw / 1e9)
-            found[f"{name}, {EPISODES} x {STEPS} steps"] = of_many
-    return found
+            total = measure(EPISODES * STEPS * size / 1e9, "GB", steps, EPISODES * STEPS * raw / 1e9)
+            measures[f"{name}, {EPISODES} x {STEPS} steps"] = total
+    return measures
 
 
 def _from_three_cameras(episode: Episode) -> Episode:
     """Return an episode, whatever its outcome, with the images of two cameras and mirrored ones of the first."""
     observations = []
-    for seen in episode.observations:
-        images = [*seen.rgb.values()]
+    for observation in episode.observations:
+        images = [*observation.rgb.values()]
         rgb = {"first": images[0], "last": images[-1], "mirrored": images[0][:, ::-1]}
-        observations.append(replace(seen, rgb=rgb, depth={}, instruction=episode.instruction))
+        observations.append(replace(observation, rgb=rgb, depth={}, instruction=episode.instruction))
     return replace(episode, outcome="success", observations=observations)
 
 
-def _loading(experiment: Experiment, store: EpisodeStore, history: int, chunk: int) -> Measure:
+def _measure_loading(experiment: Experiment, store: EpisodeStore, history: int, chunk: int) -> Measure:
     data, batches = experiment.data(store, history, chunk), experiment.options(Benchmark).batches
     data.setup("fit")
     images = [store.rows(f"rgb_{camera}")[:] for camera in store.spec.cameras]
     starts = np.array([entry.start for entry in store.episodes])
     rows = []
     for windows in map(data.order, range(batches)):
-        first = starts[np.searchsorted(starts, windows, side="right") - 1]
-        rows.append(np.maximum(windows[:, None] + np.arange(1 - history, 1), first[:, None]))  # (B, T)
+        first_rows = starts[np.searchsorted(starts, windows, side="right") - 1]
+        rows.append(np.maximum(windows[:, None] + np.arange(1 - history, 1), first_rows[:, None]))  # (B, T)
 
     # Fill two batches in turns, as one is in use while the next is made: a single one would stay in the cache.
     shapes = [(*rows[0].shape, *image.shape[1:]) for image in images]
@@ -97,6 +97,6 @@ def _loading(experiment: Experiment, store: EpisodeStore, history: int, chunk: i
             pass
 
     bare()  # warm-up: reads the images from the disk
-    floor, own = np.min([(timed(bare)[1], timed(load)[1]) for _ in range(ROUNDS)], axis=0)
+    bare_time, load_time = np.min([(timed(bare)[1], timed(load)[1]) for _ in range(ROUNDS)], axis=0)
     count = batches * data.batch_size
-    return measure(count / own, "windows/s", count, count / floor)
+    return measure(count / load_time, "windows/s", count, count / bare_time)

@@ -17,15 +17,15 @@ Measure = dict[str, Any]  # value, unit, n, floor, ratio, in this order
 
 def measure(value: float, unit: str, n: int, floor: float | None) -> Measure:
     """Return the measure of a value over `n` repetitions, rounded; `floor` is None if there is none."""
-    beside = (None, None) if floor is None else (round(floor, 2), round(value / floor, 3))
-    return {"value": round(value, 2), "unit": unit, "n": n, "floor": beside[0], "ratio": beside[1]}
+    reference = (None, None) if floor is None else (round(floor, 2), round(value / floor, 3))
+    return {"value": round(value, 2), "unit": unit, "n": n, "floor": reference[0], "ratio": reference[1]}
 
 
 def timed(work: Callable[[], Any]) -> tuple[Any, float]:
     """Return the result of `work` and its duration [s]."""
-    started = time.perf_counter()
+    start = time.perf_counter()
     result = work()
-    return result, time.perf_counter() - started
+    return result, time.perf_counter() - start
 
 
 def machine() -> dict[str, Any]:

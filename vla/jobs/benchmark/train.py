@@ -27,35 +27,35 @@ def train(experiment: Experiment) -> dict[str, Measure]:
     The floor is forward pass, backward pass and optimiser step alone, on one batch. Rounds alternate and the fastest
     counts, so that other load on the machine affects all alike.
     """
-    asked = experiment.options(Benchmark)
+    options = experiment.options(Benchmark)
     quiet_lightning()
     store, trials = demonstrations(experiment), list[tuple[str, Experiment, Any, list[_Stopwatch]]]()
-    for precision, compiled in product(asked.precisions, sorted(set(asked.compile))):
+    for precision, compiled in product(options.precisions, sorted(set(options.compile))):
         changes = {
             "learner.compile": compiled,
             "trainer.precision": precision,
-            "trainer.max_steps": WARM_UP + asked.steps,
+            "trainer.max_steps": WARM_UP + options.steps,
             "trainer.accumulate_grad_batches": 1,
             "trainer.limit_val_batches": 0,
         }
-        changed = experiment.with_values(changes)
+        variant = experiment.with_values(changes)
         name = f"train: {precision}{' compile' if compiled else ''}"
-        trials.append((name, changed, changed.fitted_learner(store), []))
-    for _ in range(asked.rounds):
-        for _, changed, learner, rounds in trials:
-            model, watch = learner.model, _Stopwatch(asked.steps)
-            data = changed.data(store, model.history, model.chunk, model)
+        trials.append((name, variant, variant.fitted_learner(store), []))
+    for _ in range(options.rounds):
+        for _, variant, learner, rounds in trials:
+            model, watch = learner.model, _Stopwatch(options.steps)
+            data = variant.data(store, model.history, model.chunk, model)
             with explain_memory_errors(experiment.config), TemporaryDirectory() as folder:
-                trainer = make_trainer(changed.config, Path(folder) / CHECKPOINTS, watch)
+                trainer = make_trainer(variant.config, Path(folder) / CHECKPOINTS, watch)
                 trainer.fit(learner, datamodule=data)
             if trainer.received_sigterm:  # Lightning ignores it in the last hook
                 raise KeyboardInterrupt
             rounds.append(watch)
-    found, samples = dict[str, Measure](), asked.steps * experiment["data"]["batch_size"]
+    measures, samples = dict[str, Measure](), options.steps * experiment["data"]["batch_size"]
     for name, _, _, rounds in trials:
-        seconds, alone = (min(getattr(each, what) for each in rounds) for what in ("seconds", "alone"))
-        found[name] = measure(samples / seconds, "samples/s", samples, samples / alone)
-    return found
+        seconds, floor = (min(getattr(stopwatch, field) for stopwatch in rounds) for field in ("seconds", "alone"))
+        measures[name] = measure(samples / seconds, "samples/s", samples, samples / floor)
+    return measures
 
 
 class _Stopwatch(lightning.Callback):
