@@ -72,7 +72,7 @@ def test_a_width_without_room_for_pairs_is_refused(kind: type[Any]) -> None:
 
 
 def test_more_cannot_be_executed_than_is_predicted() -> None:
-    with pytest.raises(ValueError, match=r"model\.execute=5 is more than the model\.chunk=4"):
+    with pytest.raises(ValueError, match=r"model\.execute=5 is more than model\.chunk=4"):
         make_act(chunk=4, execute=5)
 
 

@@ -209,5 +209,5 @@ def test_a_training_goes_on_with_batches_of_its_size_alone(folder: Path) -> None
     module = windows(folder, batch_size=4)
     saved = module.state_dict()
     module.load_state_dict(saved)
-    with pytest.raises(ValueError, match="had batches of 8 windows, and 1 processes have batches of 4"):
+    with pytest.raises(ValueError, match="had batches of 8 windows, and 1 process would have batches of 4"):
         module.load_state_dict({**saved, "batch": 8})

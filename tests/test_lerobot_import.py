@@ -398,7 +398,7 @@ def test_what_fits_the_task_nearly_is_taken_and_a_whole_picture_is_no_part_of_on
 def test_a_recording_does_not_act(home: Path) -> None:
     options = defaults_of("expert/lerobot", folder=str(home / "dataset"))
     node = {"_target_": "vla.data.formats.lerobot_import.LeRobotDemonstrations", **options}
-    with pytest.raises(ValueError, match="cannot act: this job needs the expert of a world that can be played"):
+    with pytest.raises(ValueError, match="cannot act: choose an expert that can, such as expert=waypoint"):
         make_agent(node, "expert", make_arm())
 
 
