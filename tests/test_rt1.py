@@ -10,12 +10,18 @@ import pytest
 import torch
 from defaults import defaults_of
 from fake_batch import TINY_IMAGE, TINY_TEXT, context_of, make_batch, make_rt1, with_text
+from torch import Tensor
 from toy import SPEC
 
 from vla.models.rt1 import RT1, attention_mask
 from vla.models.text.ngrams import NGrams
 from vla.models.tokenizers.tokenizer import RT1Bins, Uniform
 from vla.models.vision.timm_encoders import FilmEfficientNet
+
+
+def encoded(tokens: Tensor) -> dict[str, Tensor]:
+    """A batch of tokens (B, T, N, E), all of whose frames are present."""
+    return {"tokens": tokens, "present": torch.ones(tokens.shape[:2], dtype=torch.bool)}
 
 
 def test_the_mask_is_causal_and_hides_actions_from_actions() -> None:
@@ -51,7 +57,7 @@ def test_one_pass_equals_a_loop_over_the_action_tokens() -> None:
     sequence = torch.cat([tokens[:, 0], empty, tokens[:, 1], empty], 1)
     start = sequence.shape[1] - model.slots  # of the newest frame's action slots
     loop = [model.head(model.transform(sequence[:, : start + slot])[:, -1]) for slot in range(model.slots)]
-    one_pass = model({"tokens": tokens})["logits"][:, -1].flatten(1, 2)
+    one_pass = model(encoded(tokens))["logits"][:, -1].flatten(1, 2)
     assert torch.allclose(torch.stack(loop, 1), one_pass, atol=1e-5)
 
 
@@ -73,9 +79,9 @@ def test_no_prediction_depends_on_another_one_of_its_frame_nor_on_what_was_done(
 def test_fewer_frames_than_the_history_give_what_the_first_slots_of_a_full_window_give() -> None:
     model = make_rt1(history=3).eval()
     tokens = model.encode(with_text(model, make_batch(3)))
-    full = model({"tokens": tokens})["logits"]
+    full = model(encoded(tokens))["logits"]
     for frames in (1, 2):
-        assert torch.allclose(model({"tokens": tokens[:, :frames]})["logits"], full[:, :frames], atol=1e-5)
+        assert torch.allclose(model(encoded(tokens[:, :frames]))["logits"], full[:, :frames], atol=1e-5)
 
 
 def test_absent_frames_before_the_first_do_not_matter_as_they_are_none_in_a_policy() -> None:
@@ -84,7 +90,7 @@ def test_absent_frames_before_the_first_do_not_matter_as_they_are_none_in_a_poli
     window = torch.cat([torch.randn_like(tokens[:, :1]), tokens[:, :2]], 1)  # as in training: absent ones come first
     present = torch.tensor([False, True, True]).expand(len(tokens), -1)
     logits = model({"tokens": window, "present": present})["logits"]
-    assert torch.allclose(logits[:, 1:], model({"tokens": tokens[:, :2]})["logits"], atol=1e-5)
+    assert torch.allclose(logits[:, 1:], model(encoded(tokens[:, :2]))["logits"], atol=1e-5)
 
 
 def test_every_frame_of_the_window_is_learned_from() -> None:

@@ -95,7 +95,7 @@ def test_a_checkpoint_brings_its_task_and_model_and_takes_harder_scenes_once(hom
     for spoil in (lambda: os.utime(page, (0, 0)), page.unlink):  # the process was killed before it was written
         spoil()
         assert "evaluation is already finished" in here(home, *harder).stdout
-        assert page.stat().st_mtime > 0 and "95 % CI" in page.read_text()
+        assert page.stat().st_mtime > 0 and "95 % confidence intervals" in page.read_text()
 
 
 def test_a_policy_sees_the_pictures_of_its_training_and_those_of_the_other_renderer(

@@ -302,17 +302,14 @@ def _concatenate(batches: Sequence[Batch]) -> Batch:
 
 
 def costs(policy: Policy) -> dict[str, float]:
-    """Return the number of parameters of a policy and its latency [ms], under their names in the file of a report."""
-    return {"parameters": sum(p.numel() for p in policy.model.parameters()), "latency_ms": latency(policy)}
+    """Return the number of parameters of a policy and its latency [ms], under their names in the file of a report.
 
-
-def latency(policy: Policy) -> float:
-    """Measure the time from an observation to its action with a full history [ms].
-
-    The result is the smallest of five medians of five plans each, because other load on the machine only adds time.
+    The latency is the time from an observation to its action with a full history, the smallest of five medians of five
+    plans each, because other load on the machine only adds time.
     """
     observation = policy.spec.random_observation(np.random.default_rng(0))
     for _ in range(policy.model.history):
         policy.plan(observation)
     seconds = timeit.repeat(lambda: policy.plan(observation), number=1, repeat=25)
-    return 1000 * float(np.median(np.reshape(seconds, (5, 5)), axis=1).min())
+    latency = 1000 * float(np.median(np.reshape(seconds, (5, 5)), axis=1).min())
+    return {"parameters": sum(p.numel() for p in policy.model.parameters()), "latency_ms": latency}

@@ -152,7 +152,7 @@ class TokenContext(Context):
         learned_tokens: tokens per camera and frame.
         keypoints: number of keypoints in an additional token per camera; 0 omits the token.
         proprioception: add a token of the robot state.
-        frames_alone: omit `Fusion`, and so both of these tokens; the summary is then the mean of the newest frame.
+        frames_alone: omit `Fusion`, for a model that calls `encode` but not `forward`.
     """
 
     def __init__(
@@ -182,7 +182,7 @@ class TokenContext(Context):
         if self.proprioception:
             self.proprioception_token = nn.Linear(self.proprioception.width, width)
         self.fusion = None if frames_alone else Fusion(history, self.per_frame, self.text_width, width)
-        self.length = history * self.per_frame + (0 if frames_alone else 2)
+        self.length = history * self.per_frame + 2
 
     def encode(self, batch: Batch, text: Tensor) -> Tensor:
         """Return (B, T, n, E) tokens of the frames."""
@@ -206,8 +206,7 @@ class TokenContext(Context):
         frames = batch["tokens"] if "tokens" in batch else self.encode(batch, text)
         frames, present = newest_last(frames, batch["present"])
         padding = ~present.repeat_interleave(self.per_frame, 1)
-        if self.fusion is None:
-            return Encoded(frames.flatten(1, 2), frames[:, -1].mean(1), padding)
+        assert self.fusion is not None, "omitted only for models that do not call this"
         tokens = self.fusion(frames, text)
         return Encoded(tokens, tokens[:, -1], F.pad(padding, (0, 2)))
 

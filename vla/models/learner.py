@@ -77,7 +77,7 @@ class Learner(LightningModule):
         self._saved_precision: tuple[bool, str] | None = None  # flash attention and precision outside training
         self._non_finite_step: Tensor | None = None  # () on the device of the loss
         self.errors = nn.ModuleList(MeanMetric() for _ in spec.action)
-        self._scale = lora.scale if lora else 1.0
+        self._scale = lora.alpha / lora.rank if lora else 1.0
         if lora:
             lora.inject(model)
         if checkpointing:

@@ -36,11 +36,6 @@ class LoRA:
     alpha: Positive
     dropout: Rate
 
-    @property
-    def scale(self) -> float:
-        """Return the scale of the product, alpha / r."""
-        return self.alpha / self.rank
-
     def inject(self, model: nn.Module) -> None:
         """Add the factors to a model, in place; its other trained parameters stay trained.
 

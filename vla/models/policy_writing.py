@@ -61,8 +61,8 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
     validate = config.get("validate") or {}
     # The data module saves the digest of the demonstrations under a key with the name of its class, unknown here.
     states = [part for part in content.values() if isinstance(part, dict)]
-    trunks = {name: Source(**source) for name, source in content.get("trunks", {}).items()}
-    state = without_lora(weights_of(content), content.get("lora_scale", 1.0), trunks)
+    trunks = {name: Source(**source) for name, source in content["trunks"].items()}
+    state = without_lora(weights_of(content), content["lora_scale"], trunks)
     # Contiguous, and without shared memory, as the format demands.
     tensors = {
         name: value.detach().cpu().clone(memory_format=torch.contiguous_format)

@@ -96,8 +96,7 @@ class RT1(ContextModel, TokenModel):
         There may be fewer frames than `history`. A batch with (B, T, N, E) "tokens" from `encode` needs no images.
         """
         frames = batch["tokens"] if "tokens" in batch else self.encode(batch)
-        present = batch["present"] if "present" in batch else frames.new_ones(frames.shape[:2], dtype=torch.bool)
-        tokens, inverse_order = oldest_first(frames, present)
+        tokens, inverse_order = oldest_first(frames, batch["present"])
         empty_slots = tokens.new_zeros(*tokens.shape[:2], self.slots, tokens.shape[-1])
         hidden = self.transform(torch.cat([tokens, empty_slots], 2).flatten(1, 2))
         hidden = hidden.unflatten(1, (tokens.shape[1], -1))  # (B, T, N + A, E)

@@ -223,7 +223,7 @@ class RandomShift(nn.Module):
 
         Offsets are drawn on the device of the images, camera by camera.
         """
-        if not self.training or not rgb:
+        if not self.training:
             return rgb
         images = [*rgb.values()]
         clips, frames, height, width, _ = images[0].shape

@@ -156,7 +156,8 @@ def load_backbone(name: str, pretrained: Pretrained, size: int | None = None) ->
         raise UserError(f"model.image.name={name} is no network of timm{suggestion(name, names)}")
     config: Any = timm.get_pretrained_cfg(name)
     options: dict[str, Any] = {"num_classes": 0, "img_size": size if config.fixed_input_size else None}
-    path = _weights_file(name, config.hf_hub_id, pretrained)
+    repository = config.hf_hub_id or f"timm/{name}"
+    path = _weights_file(name, repository, pretrained)
     if path is None:
         return timm.create_model(name, **options)
     classifiers = (config.classifier,) if isinstance(config.classifier, str) else config.classifier or ()
@@ -169,13 +170,13 @@ def load_backbone(name: str, pretrained: Pretrained, size: int | None = None) ->
     except RuntimeError as error:
         raise UserError(f"{path} does not hold the weights of timm's {name}: {lines_of(error)[-1]}") from error
     del net.pretrained_cfg["state_dict"]
-    origin = pretrained if isinstance(pretrained, str) and pretrained != "auto" else config.hf_hub_id or f"timm/{name}"
+    origin = pretrained if isinstance(pretrained, str) and pretrained != "auto" else repository
     net.source = Source.of(path, pretrained.source if isinstance(pretrained, PackagedFile) else origin)
     log.info("%s: weights loaded from %s", name, path)
     return net
 
 
-def _weights_file(name: str, repository: str | None, pretrained: Pretrained) -> Path | None:
+def _weights_file(name: str, repository: str, pretrained: Pretrained) -> Path | None:
     """Return the file of the initial weights, downloaded if necessary; None for random initialisation."""
     if isinstance(pretrained, PackagedFile):
         path = pretrained.locate(WEIGHTS)
@@ -190,7 +191,7 @@ def _weights_file(name: str, repository: str | None, pretrained: Pretrained) -> 
         return Path(pretrained)
     advice = "model.image.pretrained may also be the path of a weights file, or false to start at random"
     try:
-        return fetch(repository or f"timm/{name}", WEIGHTS, advice=advice) / WEIGHTS
+        return fetch(repository, WEIGHTS, advice=advice) / WEIGHTS
     except UserError as error:
         if pretrained is True:
             raise

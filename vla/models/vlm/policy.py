@@ -100,7 +100,9 @@ class VisionLanguageAction(Model):
         require_prefix(prefix, self.execute, chunk)
         origin = None if trunk is None else Trunk(trunk)
         self.cameras = _cameras(cameras, spec, origin)
-        self.network = origin.build(network) if origin else _random_network(network)
+        if origin is None:
+            sketch(network)  # a UserError, before any weight is drawn, if they need more memory than is free
+        self.network = origin.build(network) if origin else network()
         if self.text.name is None and self.network.vocabulary < WORDS:
             raise UserError(
                 f"model.network.vocabulary={self.network.vocabulary} is less than the {WORDS} words of a prompt "
@@ -236,12 +238,6 @@ def repeated(prefix: Prefix, copies: int) -> Prefix:
 def _require_width(kind: str, components: int, width: int) -> None:
     if components > width:
         raise UserError(f"the {kind} has {components} components, more than model.network.{kind}_width={width}")
-
-
-def _random_network(network: Callable[[], FlowNetwork]) -> FlowNetwork:
-    """Build a network of random weights; a UserError, before any is drawn, if they need more memory than is free."""
-    sketch(network)
-    return network()
 
 
 def _cameras(mapping: dict[str, str | None] | None, spec: Spec, trunk: Trunk | None) -> list[str]:

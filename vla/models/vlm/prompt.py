@@ -59,14 +59,9 @@ class Prompt(TextEncoder):
             number_ids = [self._ids(f" {number}", special=False) for number in range(-1, BINS)]
             self.register_buffer("numbers", _padded_tensor(number_ids, max(map(len, number_ids))), persistent=False)
             self.register_buffer("end", torch.tensor(self._ids(";\nAction: ", special=False)), persistent=False)
-            pieces = [
-                self._ids("Task: pick it up, State:", special=True),
-                number_ids[0],
-                number_ids[1],
-                number_ids[-1],
-                self.end.tolist(),
-            ]
-            if [token for piece in pieces for token in piece] != self._ids(TRIED, special=True):
+            tried_ids = self._ids("Task: pick it up, State:", special=True)
+            tried_ids = tried_ids + number_ids[0] + number_ids[1] + number_ids[-1] + self.end.tolist()
+            if tried_ids != self._ids(TRIED, special=True):
                 raise UserError(
                     f"the tokenizer of {name} does not read numbers one by one, as {TRIED!r} needs: choose another one"
                 )

@@ -67,12 +67,10 @@ class Trunk:
     @property
     def source(self) -> Source:
         """What identifies the weights."""
-        digest, revision = hashlib.sha256(), self.folder.name if self.folder.parent.name == "snapshots" else None
-        for path in self._files:
-            with path.open("rb") as file:
-                digest.update(hashlib.file_digest(file, "sha256").digest())
-        size = sum(path.stat().st_size for path in self._files)
-        return Source(self.name, revision, digest.hexdigest(), size)
+        sources = [Source.of(path, self.name) for path in self._files]
+        digests = b"".join(bytes.fromhex(source.sha256) for source in sources)
+        size = sum(source.size for source in sources)
+        return Source(self.name, sources[0].revision, hashlib.sha256(digests).hexdigest(), size)
 
     @property
     def cameras(self) -> list[str]:
