@@ -26,7 +26,7 @@ from vla.data.index import listed
 from vla.data.verification import find_episode, require_whole, verify_store
 from vla.io.errors import UserError
 from vla.jobs.collect import demonstrations
-from vla.jobs.inspect import inspect_store, replay_episode, run
+from vla.jobs.inspect import inspect_store, run
 from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.spec import Episode
@@ -297,4 +297,5 @@ def test_the_job_merges_and_refuses_what_contradicts_itself(tmp_path: Path) -> N
     with store.writing():
         store.append(EPISODES[0])
     with pytest.raises(ValueError, match="does not contain the task of seed 0"):
-        replay_episode(tmp_path, store.folder, 0)
+        arguments = (f"inspect.folder={store.folder}", "inspect.episode=0", f"output={tmp_path}")
+        run(Experiment.of(composed("job=inspect", *arguments)))

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -98,14 +98,15 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
     output, identity = experiment.output, _identity(experiment, checkpoint)
     weights = identity["weights"]
     if checkpoint and (success := cached_success(output, experiment.config, checkpoint, weights)) is not None:
-        _renew_page(output)
+        with warn_on_error(output / PAGE):
+            write_page(output)  # once more, because a kill or a full disk may have left none, or an older one
         return success
     statements, conclusions = _statements(experiment), list[str]()
     _ = experiment.origin  # determine it now, before the code may change
     try:
         with Played(output, identity) as played:
-            with policy_for_workers(experiment, checkpoint) as make_policy:
-                reports = _play(experiment, make_policy, statements, played)
+            with agents_for_workers(experiment, checkpoint) as make_agent:
+                reports = _play(experiment, make_agent, statements, played)
             if checkpoint and read_policy(checkpoint).training.weights != weights:  # workers read them as they start
                 raise UserError(f"{checkpoint} was replaced while it was evaluated: run the evaluation again")
             report = reports[IN_DISTRIBUTION]
@@ -123,14 +124,6 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
     return report.success
 
 
-def _renew_page(output: Path) -> None:
-    """Write the page of a run if it is missing or older than the report, as after a kill or a full disk."""
-    page = output / PAGE
-    if not page.is_file() or page.stat().st_mtime < (output / REPORT).stat().st_mtime:
-        with warn_on_error(page):
-            write_page(output)
-
-
 def _identity(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]:
     """Return what determines the results of an evaluation."""
     config = {name: node for name, node in experiment.config.items() if name not in NOT_COMPARED}
@@ -140,18 +133,17 @@ def _identity(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]
     return {"weights": weights, "versions": installed_versions(), "config": config, "replayed": replayed}
 
 
-@contextmanager
-def policy_for_workers(experiment: Experiment, checkpoint: Path | None) -> Iterator[AgentFactory | None]:
-    """Yield the factory of a checkpoint's policy, which runs where `cluster.policy` says; None without a checkpoint."""
+def agents_for_workers(experiment: Experiment, checkpoint: Path | None) -> AbstractContextManager[AgentFactory]:
+    """Return a context with the factory of a checkpoint's policy, which runs where `cluster.policy` says.
+
+    Without a checkpoint it is the factory of the agent of the config.
+    """
     if checkpoint is None:
-        yield None
-        return
+        make_agent = experiment.make_agent()
+        assert make_agent is not None, "there is an agent or a checkpoint"
+        return nullcontext(make_agent)
     make_policy = experiment.make_policy(checkpoint.resolve())  # workers may be in another folder
-    if not _is_shared(experiment):
-        yield make_policy
-        return
-    with shared_policy(make_policy) as make_agent:
-        yield make_agent
+    return shared_policy(make_policy) if _is_shared(experiment) else nullcontext(make_policy)
 
 
 def _is_shared(experiment: Experiment) -> bool:
@@ -178,7 +170,7 @@ def _conditions(experiment: Experiment, make_agent: AgentFactory) -> dict[str, t
 
 
 def _play(
-    experiment: Experiment, make_policy: AgentFactory | None, statements: Sequence[Statement], played: Played
+    experiment: Experiment, make_agent: AgentFactory, statements: Sequence[Statement], played: Played
 ) -> dict[str, Report]:
     """Return condition → report on the same seeds; only the first, the training condition, is recorded.
 
@@ -186,8 +178,7 @@ def _play(
     once all statements are decided; the others play the seeds of the first, and stop once their difference is decided.
     """
     options, recordings = experiment.evaluate, experiment.output.resolve() / RECORDINGS
-    make_agent, make_recorder = experiment.make_agent() or make_policy, experiment.make_recorder(recordings)
-    assert make_agent is not None, "there is a checkpoint"
+    make_recorder = experiment.make_recorder(recordings)
     if make_recorder:
         recordings.mkdir(exist_ok=True)
     if not any(played.results.values()):

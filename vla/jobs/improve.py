@@ -24,7 +24,7 @@ from vla.data.header import is_store
 from vla.data.index import listed
 from vla.io.errors import UserError, counted
 from vla.jobs.collect import complete_store, demonstrations
-from vla.jobs.evaluate import evaluated, policy_for_workers, require_possible
+from vla.jobs.evaluate import agents_for_workers, evaluated, require_possible
 from vla.jobs.train import train
 from vla.models.policy_folder import read_policy
 from vla.rollouts.collect import collect
@@ -143,9 +143,8 @@ def _labelled_store(experiment: Experiment, checkpoint: Path, folder: Path, seed
     world = environment()
     world.close()
     store = EpisodeStore.create_or_open(folder, world.spec, nodes, experiment.collect.codec)
-    with policy_for_workers(experiment, checkpoint) as policy:
-        assert policy is not None, "there is a checkpoint"
-        agent = partial(make_supervised, policy, experiment.make_expert())
+    with agents_for_workers(experiment, checkpoint) as make_policy:
+        agent = partial(make_supervised, make_policy, experiment.make_expert())
         collect(store, environment, agent, options.episodes, experiment.cluster(), seed, keep_failures=True)
     return EpisodeStore(folder)
 

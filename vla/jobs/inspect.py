@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 from pathlib import Path
-from typing import Any
 
 from vla.config.build import require_no_paths
 from vla.config.experiment import Experiment, make_environment
@@ -32,8 +31,7 @@ def run(experiment: Experiment) -> None:
     else:
         if names := [name for name in ("stores", "where", "repair", "into") if getattr(options, name)]:
             raise UserError(f"inspect.episode replays an episode of inspect.folder: omit inspect.{names[0]}")
-        robot, recorded = experiment["task"].get("robot"), experiment["recorder"] is not None
-        replay_episode(experiment.output, Path(options.folder), options.episode, robot, recorded)
+        _replay_episode(experiment, Path(options.folder), options.episode)
 
 
 def inspect_store(wanted: Inspection) -> None:
@@ -69,22 +67,14 @@ def _store_folder(options: Inspection) -> Path:
     return target
 
 
-def replay_episode(
-    output: Path, folder: Path, seed: int, robot: dict[str, Any] | None = None, recorded: bool = True
-) -> None:
+def _replay_episode(experiment: Experiment, folder: Path, seed: int) -> None:
     """Replay the actions of a stored episode and compare the states.
 
-    Raises a UserError if there is no such episode, its store lacks the task, or the task now has another spec.
-
-    If `recorded`, write `episode-SEED.rrd`: the episode in the 3-D scene of the replay.
-
-    Args:
-        output: folder of the recording.
-        folder: of the store.
-        seed: of the episode.
-        robot: node that replaces the one of the store's task, which may not name files.
+    With a recorder, write `episode-SEED.rrd`: the episode in the 3-D scene of the replay. A robot in the experiment
+    replaces that of the store's task, which may not name files. Raises a UserError if there is no such episode, its
+    store lacks the task, or the task now has another spec.
     """
-    store = EpisodeStore(folder, damaged=True)
+    store, output, robot = EpisodeStore(folder, damaged=True), experiment.output, experiment["task"].get("robot")
     config, episode = find_episode(store, seed)
     if not isinstance(config.get("task"), dict):
         raise UserError(f"{folder} does not contain the task of seed {seed}, so there is no scene to replay it in")
@@ -94,7 +84,7 @@ def replay_episode(
     environment = make_environment(config["task"])
     store.spec.require(environment.spec, f"the episode store {folder}", "its task as it is built now")
     recorder, file_name = None, ""
-    if recorded:
+    if experiment["recorder"] is not None:
         from vla.rollouts.recorder import RerunRecorder  # imports the viewer's library
 
         recorder, file_name = RerunRecorder(output, pictures=0), f"{recording_name(seed, episode.outcome)}.rrd"

@@ -19,7 +19,7 @@ from vla.reports.page import Section, render
 from vla.reports.pictures import COLOURS, Panels, error_bars, plot_rates, save, svgs
 from vla.reports.tables import Table, config_value, duration, links, percent, rate
 from vla.reports.training_curves import training_sections
-from vla.rollouts.recordings import pictured, shown
+from vla.rollouts.recordings import moving_pictures
 from vla.runs.folder import PAGE, RECORDING, RECORDINGS, Run
 from vla.runs.sweep import DEMONSTRATIONS, SweepRow, conditions_of, failures, read_rows
 
@@ -150,7 +150,6 @@ def _config_differences(runs: Mapping[str, Run]) -> Table:
 
 
 def _failures(name: str, run: Run) -> Section:
-    results = run.report.per_episode if run.report else []
-    pictures = pictured(results, run.folder / RECORDINGS)
-    rollouts = shown((result for result in results if result.seed in pictures), FAILURES, 0)
-    return Section(f"Failures of {name}", rollouts=[(result, pictures[result.seed]) for result in rollouts])
+    failures = [result for result in run.report.per_episode if not result.success] if run.report else []
+    pictures = moving_pictures(failures, run.folder / RECORDINGS)
+    return Section(f"Failures of {name}", rollouts=pictures[:FAILURES])

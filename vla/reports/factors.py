@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from vla.data.episode_filter import flat
-from vla.reports.pictures import GREEN, GREY, RED, Interval, Panels, error_bars, plot_counts, rate_limits
+from vla.reports.pictures import GREEN, GREY, RED, Panels, error_bars, plot_counts, rate_limits
 from vla.reports.tables import in_words
-from vla.rollouts.results import ERROR, Report, Result
+from vla.rollouts.results import ERROR, Rate, Report, Result
 from vla.rollouts.statistics import wilson_interval
 
 BINS = 5  # quantile groups of a numeric factor
@@ -111,13 +111,13 @@ def _plot_points(axes: Axes, points: Sequence[tuple[float, float]], played: Sequ
     axes.set_aspect("equal", adjustable="datalim")
 
 
-def _rates_of(values: Sequence[Any], played: Sequence[Result]) -> list[Interval]:
+def _rates_of(values: Sequence[Any], played: Sequence[Result]) -> list[Rate]:
     """Return the success rate of each group of a factor, with its interval."""
     counts = [(sum(played[index].success for index in group), len(group)) for group in groups(values)]
     return [(successes / count, *wilson_interval(successes, count)) for successes, count in counts]
 
 
-def _plot_rates(axes: Axes, values: Sequence[Any], rates: Sequence[Interval], limits: tuple[float, float]) -> None:
+def _plot_rates(axes: Axes, values: Sequence[Any], rates: Sequence[Rate], limits: tuple[float, float]) -> None:
     """Plot the success rate with its interval per group of values; a group of numbers is placed at its mean."""
     split = groups(values)
     if numeric(values):

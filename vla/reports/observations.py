@@ -77,7 +77,7 @@ def draw_samples(batch: dict[str, Any], spec: Spec, path: Path) -> None:
 def _plot(axes: Axes, frames: list[Array], action: Array, spec: Spec) -> None:
     """Plot the images, and beside them a bar per component (D,) of the action within its range, with its value."""
     height = frames[0].shape[0]
-    plot_image(axes, np.concatenate([frame for frame in frames if frame.shape[0] == height], axis=1))
+    plot_image(axes, np.concatenate(frames, axis=1))
     left, step = axes.get_xlim()[1] + 1.0 * height, height / len(action)
     reach = np.maximum(np.abs(spec.low), np.abs(spec.high))
     shares = np.clip(action / reach, -1, 1)

@@ -20,9 +20,9 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import fontManager
 
 from vla.io.files import atomic_path
+from vla.rollouts.results import Rate
 from vla.spec import Array
 
-Interval = tuple[float, float, float]  # success rate and its 95 % confidence interval
 Panels = dict[str, Callable[[Axes], object]]  # title → function that draws the panel
 
 GREEN, RED, BLUE, GREY = "#2e9e5b", "#d2483f", "#3b76c4", "#8a8f98"
@@ -32,7 +32,7 @@ MIDDLE = "#7a7f86"  # readable on white and on black, for PNG files on a page
 SIZE = (3.4, 2.3)  # of a panel [inch]
 
 
-def error_bars(rates: Iterable[Interval]) -> tuple[Array, Array]:
+def error_bars(rates: Iterable[Rate]) -> tuple[Array, Array]:
     """Return the rates (N,) and the lengths (2, N) of their error bars, below and above."""
     middle, low, high = np.array([*rates]).reshape(-1, 3).T
     return middle, np.abs([middle - low, high - middle])
@@ -43,7 +43,7 @@ def rate_limits(lowest: float) -> tuple[float, float]:
     return max(0.0, math.floor(10 * lowest) / 10), 1.0
 
 
-def plot_rates(axes: Axes, rates: Mapping[str, Interval], colours: Mapping[str, str]) -> None:
+def plot_rates(axes: Axes, rates: Mapping[str, Rate], colours: Mapping[str, str]) -> None:
     """Plot a line per name with its success rate and interval, and a vertical line at the first rate."""
     middles, reach = error_bars(rates.values())
     for row, name in enumerate(rates):

@@ -16,7 +16,7 @@ from vla.reports.pictures import GREEN, svgs
 from vla.reports.result_tables import cells, conditions_table, rate_tables, secondary_table
 from vla.reports.tables import Table, config_value, duration, in_words, links, percent
 from vla.reports.training_curves import training_sections
-from vla.rollouts.recordings import pictured, shown
+from vla.rollouts.recordings import moving_pictures
 from vla.rollouts.results import ERROR, Report, Result
 from vla.runs.folder import EPISODES, ERRORS_PLOT, PAGE, RECORDING, RECORDINGS, SAMPLES, Run, read_run
 from vla.spec import IN_DISTRIBUTION
@@ -135,7 +135,7 @@ def _rounds(run: Run) -> Table:
 def _rollouts(run: Run) -> Section:
     """Return the moving pictures, what the recording contains, and how to record another episode."""
     results = [result for result in run.report.per_episode if result.outcome != ERROR] if run.report else []
-    pictures, facts = pictured(results, run.folder / RECORDINGS), dict[str, str]()
+    facts = dict[str, str]()
     if (run.folder / RECORDING).is_file() and run.report:
         seeds = {*run.report.recorded}
         counts = [
@@ -151,8 +151,7 @@ def _rollouts(run: Run) -> Section:
     if names := sorted(file.name for file in (run.folder / RECORDINGS).glob("*.rrd")):
         rest = f" and {len(names) - LISTED} more in {RECORDINGS}" if len(names) > LISTED else ""
         facts["single recordings"] = links({name: f"{RECORDINGS}/{quote(name)}" for name in names[:LISTED]}) + rest
-    rollouts = shown(result for result in results if result.seed in pictures)
-    return Section("Rollouts", ROLLOUTS, facts, rollouts=[(result, pictures[result.seed]) for result in rollouts])
+    return Section("Rollouts", ROLLOUTS, facts, rollouts=moving_pictures(results, run.folder / RECORDINGS))
 
 
 def _origins(run: Run) -> list[Section]:

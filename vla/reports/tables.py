@@ -15,8 +15,8 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from vla.config.differences import ABSENT
-from vla.reports.pictures import Interval
 from vla.rollouts.comparison import Comparison
+from vla.rollouts.results import Rate
 
 LONG = 200  # characters of a config value that are shown
 NUMBER = re.compile(r"([+-]?\d[\d.,/e+ -]*( \(.*\))?|-|)")
@@ -56,7 +56,7 @@ class Table:
         return "".join(f"| {' | '.join(line)} |\n" for line in cells)
 
 
-def rate(interval: Interval) -> str:
+def rate(interval: Rate) -> str:
     """Return a success rate with its interval, in percent."""
     return "{} ({}-{})".format(*map(percent, interval))
 

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from vla.io.errors import UserError, counted
+from vla.io.errors import counted
 from vla.io.progress import Bar
 from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed, Future, Pool
 from vla.rollouts.motion import motion_of
@@ -22,7 +22,7 @@ from vla.rollouts.recordings import Recordings, chosen
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, close_agent
 from vla.rollouts.worlds import Stage, in_lanes, play
-from vla.spec import FIRST_SEED, Agent, Agents, Environment, Episode, Recorder
+from vla.spec import Agent, Agents, Environment, Episode, Recorder
 
 log = logging.getLogger(__name__)
 
@@ -56,10 +56,8 @@ def evaluate(
     does not depend on the number of workers.
 
     Episodes whose seeds are in `known`, seed → result, are not played again. `keep` is called with every new result but
-    errors. Raises a UserError if there are no seeds, seeds are in the range of collection, or the cluster raises one.
+    errors. Raises a UserError if the cluster raises one.
     """
-    if not seeds or min(seeds) < FIRST_SEED:
-        raise UserError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
     make = partial(_RolloutWorker, make_environment, make_agent, None if recordings == 0 else make_recorder, lanes)
     record_all, score = recordings == "all", _Score(seeds, dict(known or {}), until, turns)
     with cluster.pool(make) as pool:
@@ -222,13 +220,14 @@ class _RolloutWorker:
         self._agent = make_agent(environment)
         further_lanes = range(1, lanes if isinstance(self._agent, Agents) else 1)
         self._environments = [environment, *(make_environment() for _ in further_lanes)]
-        recorders = [None if make_recorder is None else _LenientRecorder(make_recorder()) for _ in self._environments]
-        self._stages = [Stage(*pair) for pair in zip(self._environments, recorders, strict=True)]
+        self._recorders = [_LenientRecorder(make_recorder()) if make_recorder else None for _ in self._environments]
 
     def attempt(self, item: tuple[Sequence[int], bool]) -> list[Result]:
         """Play the episodes of seeds, and record them if the second part of the item says so."""
         seeds, recorded = item
-        results = play(self._stages, in_lanes(self._agent), seeds, recorded, recorded)
+        recorders = self._recorders if recorded else [None] * len(self._recorders)
+        stages = [Stage(*pair) for pair in zip(self._environments, recorders, strict=True)]
+        results = play(stages, in_lanes(self._agent), seeds, all_images=recorded)
         return [result_of(seed, result, self._environments[0].spec.control_hz) for seed, result in results]
 
     def close(self) -> None:

@@ -17,13 +17,11 @@ LARGEST = 4 << 20  # [bytes] of a file
 
 
 def save_moving_picture(episode: Episode, path: Path) -> None:
-    """Write an episode as an animated WebP, its cameras side by side; without images write nothing.
+    """Write an episode as an animated WebP, its cameras side by side.
 
     Long episodes play faster, so that every picture takes about five seconds.
     """
-    observations = [observation for observation in episode.observations if observation.rgb]
-    if not observations:
-        return
+    observations = episode.observations
     indices = np.linspace(0, len(observations) - 1, min(FRAMES, len(observations))).round().astype(int)
     first_frame, *frames = (_frame(observations[int(index)]) for index in indices)
     duration = [*[MILLISECONDS] * len(frames), LAST_MILLISECONDS]

@@ -40,12 +40,6 @@ class Network:
     loss: Rate
     ensemble: NonNegative | None
 
-    def draw(self, random: np.random.Generator) -> tuple[float, bool]:
-        """Return the time from an observation to its answer [s], and whether that is lost."""
-        share, lost = random.random(2)
-        lost = bool(lost < self.loss)
-        return self.latency + self.jitter * (1.0 if lost else share), lost
-
 
 IDEAL = Network(latency=0.0, jitter=0.0, loss=0.0, ensemble=None)
 
@@ -140,7 +134,9 @@ class SimulatedLink:
 
     def send(self, observation: Observation, first: bool) -> Delayed:
         """Compute the chunk, and draw when it arrives; the `first` one is never lost."""
-        seconds, lost = self._network.draw(self._random)
+        network, (share, draw) = self._network, self._random.random(2)
+        lost = draw < network.loss
+        seconds = network.latency + network.jitter * (1.0 if lost else share)
         steps = math.ceil(seconds * self._hz - 1e-9)
         actions = self._plan(observation)  # even if it is lost, which happens on the way back
         return Delayed(self, self.now + (max(steps, 1) if lost else steps), None if lost and not first else actions)

@@ -33,21 +33,20 @@ def chosen(report: Report, wanted: Recordings) -> list[Result]:
     return (failures + successes)[: None if wanted == "all" else wanted]
 
 
-def shown(episodes: Iterable[Result], failures: int = FAILURES_SHOWN, successes: int = SUCCESSES_SHOWN) -> list[Result]:
-    """Return the first failures, then the first successes; failures cycle through the outcomes."""
-    counts, places = Counter[str](), list[tuple[int, Result]]()
-    for result in sorted(episodes, key=lambda result: result.seed):
-        places.append((counts[result.outcome], result))
-        counts[result.outcome] += 1
-    results = [result for _, result in sorted(places, key=lambda place: place[0])]
-    failed, succeeded = ([result for result in results if result.success == good] for good in (False, True))
-    return failed[:failures] + succeeded[:successes]
+def moving_pictures(results: Iterable[Result], folder: Path) -> list[tuple[Result, Path]]:
+    """Return the results whose moving pictures in a folder are shown: the first failures, then the first successes.
 
-
-def pictured(results: Iterable[Result], folder: Path) -> dict[int, Path]:
-    """Return seed → moving picture in a folder, of the results that have one."""
+    Failures cycle through the outcomes.
+    """
     files = {path.stem: path for path in folder.glob("*.webp")}  # listed, because outcomes may come from a report
-    return {each.seed: files[name] for each in results if (name := recording_name(each.seed, each.outcome)) in files}
+    counts, places = Counter[str](), list[tuple[int, Result, Path]]()
+    for result in sorted(results, key=lambda result: result.seed):
+        if file := files.get(recording_name(result.seed, result.outcome)):
+            places.append((counts[result.outcome], result, file))
+            counts[result.outcome] += 1
+    pairs = [(result, file) for _, result, file in sorted(places, key=lambda place: place[0])]
+    failures, successes = ([pair for pair in pairs if pair[0].success == good] for good in (False, True))
+    return failures[:FAILURES_SHOWN] + successes[:SUCCESSES_SHOWN]
 
 
 def clear(folder: Path, kept: Container[Path] = ()) -> None:
@@ -77,11 +76,10 @@ def merge_recordings(report: Report, folder: Path, target: Path, wanted: Recordi
 
 
 def keep_pictures(report: Report, folder: Path, wanted: Recordings, merged: Container[int]) -> None:
-    """Keep the recordings of `wanted` episodes that were not `merged`, and the moving pictures to be `shown`; remove
+    """Keep the recordings of `wanted` episodes that were not `merged`, and the `moving_pictures` of wanted ones; remove
     all others, and the folder if it is then empty."""
     results = chosen(report, wanted)
-    pictures = pictured(results, folder)
-    paths = {pictures[result.seed] for result in shown(result for result in results if result.seed in pictures)}
+    paths = {file for _, file in moving_pictures(results, folder)}
     unmerged = (result for result in results if result.seed not in merged)
     clear(folder, paths | {folder / f"{recording_name(result.seed, result.outcome)}.rrd" for result in unmerged})
     with suppress(OSError):

@@ -113,13 +113,9 @@ class Report:
     def interval(self) -> tuple[float, float]:
         """95 % confidence interval of `success`; with tiers, the tasks are fixed strata."""
         if self.anytime or not self.tiers:
-            return self.interval_of(self.successes)
+            return self.counted(self.successes)[2:]
         # Known tasks only: an error in `seen` leaves other conditions without its task.
         return self._stratified([self.tasks])[1:]
-
-    def interval_of(self, count: float) -> tuple[float, float]:
-        """Return the 95 % confidence interval of the rate of an event that `count` completed episodes had."""
-        return anytime_interval(count, self.episodes - count) if self.anytime else wilson_interval(count, self.episodes)
 
     @property
     def milestones(self) -> dict[str, int]:
@@ -177,7 +173,9 @@ class Report:
         """Return the rate of an event that `count` completed episodes had, by default of success."""
         if count is None:
             return Counted(self.successes, self.episodes, *self.interval)
-        return Counted(count, self.episodes, *self.interval_of(count))
+        episodes = self.episodes
+        interval = anytime_interval(count, episodes - count) if self.anytime else wilson_interval(count, episodes)
+        return Counted(count, episodes, *interval)
 
     @property
     def rates(self) -> dict[str, dict[str, Counted]]:

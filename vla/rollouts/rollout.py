@@ -21,8 +21,7 @@ def rollout(
 
     Raises a UserError if an action has the wrong shape or is not finite, or the episode is over at its start.
     """
-    stage = Stage(environment, recorder)
-    ((_, result),) = play([stage], in_lanes(agent), [seed], recorder is not None, all_images)
+    ((_, result),) = play([Stage(environment, recorder)], in_lanes(agent), [seed], all_images)
     if isinstance(result, Exception):
         raise result
     return result

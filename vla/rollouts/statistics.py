@@ -54,7 +54,7 @@ def stratified_interval(strata: Sequence[tuple[int, int, float]]) -> tuple[float
 
 
 def bounded_mean_interval(values: Sequence[float], largest: float) -> tuple[float, float]:
-    """Return the 95 % confidence interval of the mean of values from 0 to `largest`, (0, `largest`) without any.
+    """Return the 95 % confidence interval of the mean of at least one value from 0 to `largest`.
 
     Wilson's interval at the effective sample size, at which the binomial variance equals the estimated one; half a zero
     and half a `largest` are added in estimating it, else equal values would seem certain. If all values are 0 or
@@ -62,8 +62,6 @@ def bounded_mean_interval(values: Sequence[float], largest: float) -> tuple[floa
     """
     shares = np.asarray(values, float) / largest
     count, total = len(shares), float(shares.sum())
-    if not count:
-        return 0.0, largest
     smooth = (total + 0.5) / (count + 1)
     variance = (float(np.square(shares).sum()) + 0.5) / (count + 1) - smooth**2
     effective_size = count * smooth * (1 - smooth) / variance

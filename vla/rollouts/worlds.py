@@ -20,13 +20,12 @@ from vla.spec import Agent, Agents, Array, Environment, Episode, Observation, Re
 
 
 class Stage:
-    """One world, with the observations and actions of its current episode so far."""
+    """One world, with the observations and actions of its current episode so far, and perhaps a recorder of them."""
 
     def __init__(self, environment: Environment, recorder: Recorder | None = None) -> None:
         self.environment, self._recorder = environment, recorder
-        self._recording: Recorder | None = None
 
-    def reset(self, seed: int, recorded: bool = False) -> Observation:
+    def reset(self, seed: int) -> Observation:
         """Start the episode of a seed; raise a UserError if it is over at its start."""
         self._observation = self.environment.reset(seed)
         if self.environment.done:
@@ -34,9 +33,8 @@ class Stage:
         self._seed, self._seen, self._labels, self._executed = seed, list[Observation](), list[Array](), list[Array]()
         # Read after the reset: the tool of a world may exist only from its first episode on.
         self._tool = [getattr(self.environment, "tool", None)]
-        self._recording = self._recorder if recorded else None
-        if self._recording is not None:
-            self._recording.start(self.environment)
+        if self._recorder is not None:
+            self._recorder.start(self.environment)
         return self._observation
 
     def step(self, action: Array, info: Mapping[str, Any], blind: bool) -> Observation | Episode:
@@ -48,8 +46,8 @@ class Stage:
         self._seen.append(copied(self._observation))
         self._labels.append(np.array(info.get("clean", action), dtype=np.float32))
         self._executed.append(action)
-        if self._recording is not None:
-            self._recording.step(self._observation, action, info)
+        if self._recorder is not None:
+            self._recorder.step(self._observation, action, info)
         with self.environment.blind() if blind else nullcontext():
             self._observation = self.environment.step(action)
         if self._tool[0] is not None:
@@ -72,8 +70,8 @@ class Stage:
             completed=(environment.completed, count) if count > 1 else None,
             tool=None if self._tool[0] is None else np.array(self._tool),
         )
-        if self._recording is not None:
-            self._recording.end(episode)
+        if self._recorder is not None:
+            self._recorder.end(episode)
         return episode
 
 
@@ -119,7 +117,7 @@ class _Episode:
 
 
 def play(
-    stages: Sequence[Stage], agents: Agents, seeds: Sequence[int], recorded: bool = False, all_images: bool = True
+    stages: Sequence[Stage], agents: Agents, seeds: Sequence[int], all_images: bool = True
 ) -> Iterator[tuple[int, Any]]:
     """Play the episodes of seeds side by side, on a stage per lane; yield (seed, `Episode` or error) as each ends.
 
@@ -140,7 +138,7 @@ def play(
                 next_seed = next((seed for seed in queue if seed % len(stages) == lane), queue[0])
                 queue.remove(next_seed)
                 episodes[lane] = _Episode(next_seed, all_images=all_images)
-                answers[lane] = _result_or_error(stage.reset, next_seed, recorded)
+                answers[lane] = _result_or_error(stage.reset, next_seed)
         arrivals, answers = answers, {}
         observations: dict[int, Observation] = {}
         results: dict[int, Any] = {}
@@ -152,7 +150,7 @@ def play(
                     observations[lane] = answer
                 else:  # an image is missing: play it again
                     episodes[lane] = _Episode(episodes[lane].seed, all_images=True)
-                    answers[lane] = _result_or_error(stages[lane].reset, episodes[lane].seed, recorded)
+                    answers[lane] = _result_or_error(stages[lane].reset, episodes[lane].seed)
             except Exception as error:  # of any kind: agents are user code
                 results[lane] = error
         for lane, action in _actions(agents, observations, len(stages[0].environment.spec.action)).items():

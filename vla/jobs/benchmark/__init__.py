@@ -16,6 +16,7 @@ from vla.io.files import write_json
 from vla.io.printable import show
 from vla.jobs.benchmark.measure import Measure, machine, other_load
 from vla.parallel.limits import cores
+from vla.reports.tables import Table
 
 log = logging.getLogger(__name__)
 
@@ -29,8 +30,6 @@ def run(experiment: Experiment) -> dict[str, Measure]:
     Both name the processor, and how many of its cores other programs used during a stage. Raises a UserError if there
     is no policy to evaluate.
     """
-    from vla.reports.tables import Table  # imports matplotlib
-
     host, measures, names = machine(), dict[str, Measure](), experiment.options(Benchmark).names
     if "evaluate" in names and experiment.checkpoint is None:  # before the others, which take minutes
         raise UserError("benchmark.names=[evaluate] plays a trained policy: add checkpoint=RUN")
