@@ -84,7 +84,7 @@ def importable(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Non
     """Within, this process finds the package as well, and trusts nothing; commands need no processes of their own."""
     monkeypatch.syspath_prepend(installed)
     monkeypatch.setenv(packages.TRUSTED, "")
-    caches = (packages.option_packages, packages.option_folders, packages.can_be_trusted)
+    caches = (packages.option_folders, packages.can_be_trusted)
     for cached in caches:
         cached.cache_clear()
     yield

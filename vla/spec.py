@@ -229,9 +229,8 @@ class Observation:
     rgb: dict[str, Array]  # camera → (H, W, 3) uint8
     state: Array  # (P,) float32
     instruction: str
-    depth: dict[str, Array] = field(
-        default_factory=dict
-    )  # camera → (H, W) uint16 [mm], 0: nothing is there, not even a sky (ROS 16UC1)
+    # camera → (H, W) uint16 [mm], 0: nothing is there, not even a sky (ROS 16UC1)
+    depth: dict[str, Array] = field(default_factory=dict)
     truth: dict[str, Array] | None = None  # simulator only: for experts, never for policies
     running: Running | None = None  # for policies that continue it
 

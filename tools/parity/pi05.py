@@ -27,7 +27,7 @@ from lerobot.policies.pi05 import modeling_pi05
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.pi05.processor_pi05 import make_pi05_pre_post_processors
 from lerobot.processor import tokenizer_processor
-from references import TOLERANCE, write
+from references import TOLERANCE, lerobot_results, write
 from safetensors.torch import load_file
 from tiny_pi import CHUNK, LENGTHS, SIZES, STATE_WIDTH, STATISTICS, STEPS, TASKS, inputs, observed, tokenizer
 from tiny_vla import deviation, fill
@@ -92,29 +92,12 @@ def their_policy(name: str) -> Any:
 
 
 def network_results(theirs: Any) -> dict[str, Tensor]:
-    """Return losses, (B, k, A), their gradients, and the actions at the beginning of every step and after the last."""
-    batch, steps, denoise = inputs(), [], theirs.denoise_step
-    images, cameras = ([*batch[name].unbind(1)] for name in ("images", "cameras"))
-    observation = (images, cameras, batch["tokens"], batch["sentence"])
-    losses = theirs(*observation, batch["actions"], batch["noise"], batch["time"])
-    losses.mean().backward()
-
-    def recorded(**values: Any) -> Tensor:
-        steps.append(values["x_t"])
-        return denoise(**values)
-
-    theirs.denoise_step = recorded
-    steps.append(theirs.sample_actions(*observation, noise=batch["noise"]))
-    theirs.denoise_step = denoise
-    parameters = dict(theirs.named_parameters())
-    weights = {
-        f"gradient.{name}": parameters[
-            f"paligemma_with_expert.{prefix}{name.partition('.')[2].removeprefix('vision_tower.')}"
-        ]
+    """Return what the network computes, see `lerobot_results`."""
+    gradients = {
+        name: f"paligemma_with_expert.{prefix}{name.partition('.')[2].removeprefix('vision_tower.')}"
         for name, prefix in GRADIENTS.items()
     }
-    gradients = {name: weight.grad for name, weight in weights.items()}
-    return {"losses": losses.detach(), "steps": torch.stack(steps), **gradients}
+    return lerobot_results(theirs, ("tokens", "sentence"), inputs(), gradients)
 
 
 def without_hub() -> None:

@@ -15,9 +15,9 @@ from typing import Any
 import lerobot_modules  # first: it makes the imports of LeRobot possible
 import torch
 from fake_batch import as_policy
-from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy, VLAFlowMatching
+from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 from lerobot.policies.smolvla.processor_smolvla import make_smolvla_pre_post_processors  # registers its steps
-from references import TOLERANCE, write
+from references import TOLERANCE, lerobot_results, write
 from smolvla_peer import their_network, without_hub
 from tiny_vla import (
     CHUNK,
@@ -62,25 +62,6 @@ def trunk_config(sizes: dict[str, Any]) -> SmolVLMConfig:
     return SmolVLMConfig(text_config=text, vision_config=vision, scale_factor=sizes["shuffle"])
 
 
-def their_results(network: VLAFlowMatching, given: dict[str, Tensor], gradients: list[str]) -> dict[str, Tensor]:
-    """Losses, named gradients, and the noisy actions before every step of sampling and after the last."""
-    images, cameras = ([*given[name].unbind(1)] for name in ("images", "cameras"))
-    batch = images, cameras, given["tokens"], given["sentence"], given["state"]
-    losses = network(*batch, given["actions"], given["noise"], given["time"])
-    losses.mean().backward()
-    parameters, samples, denoise = dict(network.named_parameters()), list[Tensor](), network.denoise_step
-
-    def recorded(**values: Any) -> Tensor:
-        samples.append(values["x_t"])
-        return denoise(**values)
-
-    network.denoise_step = recorded
-    with torch.no_grad():
-        samples.append(network.sample_actions(*batch, noise=given["noise"]))
-    grads = {f"gradient.{name}": parameters[name].grad for name in gradients}
-    return {"losses": losses.detach(), "steps": torch.stack(samples), **grads}
-
-
 def compare(name: str, ours: Tensor, theirs: Tensor) -> None:
     """Print the largest difference; fail above the tolerance."""
     error = deviation(ours, theirs)
@@ -97,7 +78,8 @@ def compare_networks() -> dict[str, Tensor]:
     assert unmatched_names == {"vlm_with_expert.vlm.lm_head.weight"}, unmatched_names
     our_results = network_results(network, inputs(SMOLVLA))
     gradients = [name.removeprefix("gradient.") for name in our_results if name.startswith("gradient.")]
-    results = their_results(reference, inputs(SMOLVLA), gradients)
+    names = ("tokens", "sentence", "state")
+    results = lerobot_results(reference, names, inputs(SMOLVLA), {name: name for name in gradients})
     for name, value in results.items():
         compare(name, our_results[name], value)
     return results

@@ -67,8 +67,7 @@ def locate(key: str, target: Any) -> type:
         kind, hint = (MissingLibrary, how_to_install(str(error.name))) if library else (UserError, "")
         raise kind(f"{key} is {target}, which cannot be imported{place}: {error}{hint}") from error
     # A module's attributes include its imports, such as `os`.
-    defined = isinstance(attribute, type) and attribute.__module__.partition(".")[0] in (OWN.rstrip("."), package)
-    if not isinstance(attribute, type) or not (target in LIBRARY or defined):
+    if not isinstance(attribute, type) or attribute.__module__.partition(".")[0] not in (OWN.rstrip("."), package):
         raise UserError(f"{key} must name a class that is defined in {package}, got {target!r}")
     return attribute
 

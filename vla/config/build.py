@@ -144,7 +144,7 @@ def makes(group: Group) -> Any:
 
 
 def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) -> None:
-    """Check a plain node at `key` against the signature of its class, without the `runtime` arguments.
+    """Check a plain node at `key`, "" at the top, against the signature of its class, without `runtime` arguments.
 
     A factory, a node with `_partial_: true`, may lack the arguments that its caller adds: keyword-only ones, and the
     runtime arguments of groups. It is allowed inside another node only. Raises a UserError if the class is not an
@@ -159,27 +159,21 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
     if not fits(target, expected):
         kind = " or ".join(alternative.__name__ for alternative in getattr(expected, "__args__", (expected,)))
         raise UserError(f"{key}._target_ must name a class of kind {kind}, got {node['_target_']}")
-    values = {name: value for name, value in node.items() if name not in HYDRA_KEYS}
-    check_arguments(key, values, target, runtime, partial, NARROWER.get(node["_target_"], {}))
+    _check_arguments(key, node, target, runtime, partial)
     if "package" in node:
         require_trusted(key, node["package"], imported=True)
 
 
-def check_arguments(
-    key: str,
-    values: Mapping[str, Any],
-    target: type,
-    runtime: Sequence[str] = (),
-    partial: bool = False,
-    narrower: Mapping[str, Any] | None = None,
-) -> None:
-    """Check the arguments of the class `target` in a node at `key`, see `check_node`."""
+def _check_arguments(key: str, node: Mapping[str, Any], target: type, runtime: Sequence[str], partial: bool) -> None:
+    """Check the arguments of the class `target` in a node, see `check_node`."""
+    values = {name: value for name, value in node.items() if name not in HYDRA_KEYS}
     parameters = arguments(target)
     variadic = [name for name, parameter in parameters.items() if parameter.kind is inspect.Parameter.VAR_KEYWORD]
     names = [name for name in parameters if name not in (*runtime, *variadic)]
     if missing := [name for name in runtime if not variadic and name not in parameters]:
         raise UserError(f"{key}: {target.__name__} must take the arguments {', '.join(missing)}, which the job gives")
-    hints = {name: parameter.annotation for name, parameter in parameters.items()} | dict(narrower or {})
+    hints = {name: parameter.annotation for name, parameter in parameters.items()}
+    hints |= NARROWER.get(node["_target_"], {})
     prefix = f"{key}." if key else ""
     for name, value in values.items():
         if not variadic or str(name).startswith("_"):

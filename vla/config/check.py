@@ -9,7 +9,7 @@ from inspect import Parameter
 from typing import Any
 
 from vla.config.annotations import MissingLibrary, fits, locate
-from vla.config.build import GROUPS, Group, arguments, check_arguments, check_node, makes, require_known
+from vla.config.build import GROUPS, Group, arguments, check_node, makes, require_known
 from vla.config.differences import ABSENT, at
 from vla.config.experiment import Experiment
 from vla.config.nodes import Evaluation, Rounds, Settings, Validation, with_changes
@@ -66,7 +66,7 @@ def _check(experiment: Experiment, job: Job) -> None:
     job_names = {file.stem for file in files}  # an experiment may have options of another job
     for name in (name for name in config if name not in job_names):
         require_known("", name, {**values, **GROUPS, **groups}, "the config")
-    check_arguments("", values, Settings)
+    check_node("", {"_target_": "vla.config.nodes.Settings", **values}, Settings)
     settings = experiment.settings
     if config.get("agent") is not None:
         if "agent" not in groups:

@@ -46,12 +46,6 @@ def offer_options() -> None:
     Plugins.instance().register(_InstalledOptions)
 
 
-@cache
-def option_packages() -> frozenset[str]:
-    """Return the installed packages that name a folder of options, even if it does not exist."""
-    return frozenset(entry.value.partition(".")[0] for entry in entry_points(group=ENTRY_POINTS))
-
-
 def config_folders() -> tuple[Path, ...]:
     """Return the folders of all options, that of `vla` first. Raises as `option_folders`."""
     return CONF, *(folder for _, folder in option_folders())
@@ -90,7 +84,7 @@ def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> Non
     names = [*packages, *_names(TRUST), *used]
     for name in names:
         _require_trustworthy("package" if name in used else "trust", name)
-    providers = option_packages()
+    providers = {package for package, _ in option_folders()}
     classes = {target for target in chosen if isinstance(target, str) and target.partition(".")[0] in providers}
     os.environ[TRUSTED] = ",".join(sorted({*names, *classes}))
 

@@ -45,7 +45,13 @@ def read_json(path: Path, kind: type[T], largest: int = MAX_BYTES) -> T:
 
 def read_yaml(path: Path, kind: type[T]) -> T:
     """Read the YAML file at `path` as a `kind`, see `read_json`. Aliases are refused: they expand without bound."""
-    return parse_yaml(read_bounded(path, MAX_YAML_BYTES), kind, str(path))
+    text = read_bounded(path, MAX_YAML_BYTES)
+    try:
+        _require_shallow(text)
+        json_text = json.dumps(yaml.load(text, Loader=yaml.CSafeLoader))
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:  # ValueError: also an impossible date
+        raise UserError(f"{path} is no plain YAML: {' '.join(str(error).split())[:200]}") from error
+    return parse_json(json_text, kind, str(path))
 
 
 def parse_json(text: str | bytes, kind: type[T], name: str) -> T:
@@ -71,27 +77,14 @@ def lines_of(error: BaseException) -> list[str]:
     return (str(error).strip() or type(error).__name__).splitlines()
 
 
-def parse_yaml(text: str | bytes, kind: type[T], name: str) -> T:
-    """Parse YAML text, called `name` in errors, as a `kind`, see `read_yaml`."""
-    try:
-        is_shallow = _is_shallow(text)
-        json_text = json.dumps(yaml.load(text, Loader=yaml.CSafeLoader) if is_shallow else None)
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:  # ValueError: also an impossible date
-        raise UserError(f"{name} is no plain YAML: {' '.join(str(error).split())[:200]}") from error
-    if not is_shallow:
-        raise UserError(f"{name} is nested deeper than {MAX_DEPTH} levels, or has aliases or numbers of 100 digits")
-    return parse_json(json_text, kind, name)
-
-
-def _is_shallow(text: str | bytes) -> bool:
-    """Return whether YAML text has at most `MAX_DEPTH` levels, and neither aliases nor long numbers."""
+def _require_shallow(text: bytes) -> None:
+    """Raise a ValueError unless YAML text has at most `MAX_DEPTH` levels, and neither aliases nor long numbers."""
     depth = 0
     for event in yaml.parse(text, Loader=yaml.CSafeLoader):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         is_long_number = isinstance(event, yaml.ScalarEvent) and LONG_NUMBER.fullmatch(event.value)
         if depth > MAX_DEPTH or is_long_number or isinstance(event, yaml.AliasEvent):
-            return False
-    return True
+            raise ValueError(f"nested deeper than {MAX_DEPTH} levels, or with aliases or numbers of 100 digits")
 
 
 def resolved(value: Any, name: str) -> Any:
@@ -125,23 +118,8 @@ def resolved(value: Any, name: str) -> Any:
 
 
 def read_resolved(path: Path) -> Any:
-    """Read the JSON file at `path` as a configuration, see `resolved`.
-
-    Also raises a UserError if a key occurs twice, or a text has a lone surrogate, which could not be written again.
-    """
-
-    def unique_mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(mapping := dict(pairs)) < len(pairs):
-            raise UserError("a mapping has one key twice")
-        return mapping
-
-    try:
-        text = read_bounded(path, MAX_RESOLVED_BYTES)
-        value = json.loads(text, object_pairs_hook=unique_mapping, parse_constant=int)  # int("NaN") raises a ValueError
-        json.dumps(value, ensure_ascii=False).encode()
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is damaged or of another kind: {str(error)[:200]}") from error
-    return resolved(value, str(path))
+    """Read the JSON file at `path` as a configuration, see `read_json` and `resolved`."""
+    return resolved(read_json(path, Any, MAX_RESOLVED_BYTES), str(path))
 
 
 def mappings(value: Any) -> Iterator[dict[Any, Any]]:

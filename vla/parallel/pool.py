@@ -12,7 +12,7 @@ import signal
 import threading
 from collections.abc import Iterable, Iterator
 from concurrent import futures
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from multiprocessing import resource_tracker
 from typing import Any, Literal
 
@@ -90,8 +90,8 @@ class _LazyFuture:
         """Do nothing: work starts only in `result`."""
 
 
-class ProcessPool:
-    """Spawned processes with one worker each; a GL context would not survive a fork.
+class ProcessPool(AbstractContextManager["ProcessPool"]):
+    """Spawned processes with one worker each, which start on demand; a GL context would not survive a fork.
 
     Every process belongs to one thread of this process, which sends it items and waits for the results. When a process
     crashes, a new one retries its item once: in long runs processes occasionally crash outside Python. Only this
@@ -117,10 +117,6 @@ class ProcessPool:
     def as_completed(self, pending: Iterable[Any]) -> Iterator[Any]:
         """Yield futures as they complete."""
         return futures.as_completed(pending)
-
-    def __enter__(self) -> ProcessPool:
-        """Enter the context; processes start on demand."""
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """End all processes: after their current item on normal exit, at once after an exception or Ctrl-C."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import repeat
 from typing import Annotated, Any
 
 from pydantic import AfterValidator
@@ -101,20 +100,19 @@ class Condition:
 
     __pydantic_config__ = LENIENT
 
-    outcomes: list[str]  # with `anytime`, perhaps of the first seeds only
+    # Per episode; with `anytime`, perhaps of the first seeds only.
+    outcomes: list[str]
+    reached: list[tuple[str, ...]]  # milestones
+    motions: list[Motion | None]
     compared: dict[str, Comparison] = field(default_factory=dict)  # with the training condition, metric → comparison
-    # Per episode, as `outcomes`; empty in reports written before these were stored.
-    reached: list[tuple[str, ...]] = field(default_factory=list)  # milestones
-    motions: list[Motion | None] = field(default_factory=list)
     anytime: bool = False  # intervals are valid whatever the reason to stop playing
 
     def report(self, seeds: Sequence[int], tasks: Sequence[str], tiers: Mapping[str, Sequence[str]]) -> Report:
         """Return the report on episodes of these seeds and tasks, without draws and instructions."""
-        reached, motions = self.reached or repeat(()), self.motions or repeat(None)
         results = (
             Result(seed, outcome, task=task, milestones=milestones, motion=motion)
             for seed, task, outcome, milestones, motion in zip(
-                seeds, tasks, self.outcomes, reached, motions, strict=False
+                seeds, tasks, self.outcomes, self.reached, self.motions, strict=False
             )
         )
         return Report(tuple(results), tiers, self.anytime)
@@ -150,7 +148,7 @@ class ReportFile:
             count = len(condition.outcomes)
             if count > len(self.seeds) or (count < len(self.seeds) and not condition.anytime):
                 raise UserError(f"conditions.{name} has {count} outcomes of {len(self.seeds)} seeds")
-            if any(len(column) not in (0, count) for column in (condition.reached, condition.motions)):
+            if not count == len(condition.reached) == len(condition.motions):
                 raise UserError(f"conditions.{name} has other episodes in reached or motions than in outcomes")
 
     @cached_property

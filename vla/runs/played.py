@@ -6,6 +6,7 @@ import json
 import logging
 from collections import defaultdict
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
@@ -23,7 +24,7 @@ log = logging.getLogger(__name__)
 Episode = tuple[str, Result]  # condition, result
 
 
-class Played:
+class Played(AbstractContextManager["Played"]):
     """Results so far, in a file that is removed at the end of this context, but stays after an error."""
 
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
@@ -48,10 +49,6 @@ class Played:
             if count := len(lines) - 1:
                 log.info("episodes already played: %d, in %s", count, self._path)
         write_text(self._path, "".join(lines))
-
-    def __enter__(self) -> Played:
-        """Return itself."""
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Remove the file, unless an error leaves results to continue with, and release the lock."""
