@@ -234,6 +234,12 @@ class Observation:
     truth: dict[str, Array] | None = None  # simulator only: for experts, never for policies
     running: Running | None = None  # for policies that continue it
 
+    def require_truth(self, who: str) -> dict[str, Array]:
+        """Return the truth; if there is none, a UserError says that `who` needs it."""
+        if self.truth is None:
+            raise UserError(f"{who} needs the simulator's truth, which this observation lacks")
+        return self.truth
+
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], spec: Spec) -> Observation:
         """Convert a gymnasium observation: images by camera, "state", "instruction"; a UserError if one is missing."""

@@ -128,8 +128,6 @@ class Perturbed:
         """Return the (D,) float32 action to execute (UserError: the observation lacks the simulator's truth)."""
         clean = self._expert.act(observation)
         self.info = {**self._expert.info, "clean": clean}
-        if observation.truth is None:
-            raise UserError("expert.perturb needs the simulator's truth, which this observation lacks")
         options = {name: self._expert.info[name] for name in ("must_turn", "steady") if name in self._expert.info}
-        action = self._perturb(clean, observation.truth, **options)
+        action = self._perturb(clean, observation.require_truth("expert.perturb"), **options)
         return np.clip(action, self._spec.low, self._spec.high).astype(np.float32)

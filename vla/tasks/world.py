@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -81,11 +82,10 @@ class Streams:
     """
 
     def __init__(self) -> None:
-        self._made: dict[str, np.random.RandomState] = {}
+        self._streams = defaultdict[str, np.random.RandomState](np.random.RandomState)
 
     def __call__(self, seed: int, name: str) -> np.random.RandomState:
         """Return the stream called `name`, seeded for the episode `seed`."""
-        if name not in self._made:
-            self._made[name] = np.random.RandomState()
-        self._made[name].seed(np.random.SeedSequence([seed, crc32(name.encode())]).generate_state(8))
-        return self._made[name]
+        stream = self._streams[name]
+        stream.seed(np.random.SeedSequence([seed, crc32(name.encode())]).generate_state(8))
+        return stream

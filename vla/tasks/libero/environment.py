@@ -182,11 +182,10 @@ class Scene:
         if unknown_cameras := [name for name in spec.cameras if name not in camera_names]:
             raise UserError(f"task.cameras names {', '.join(unknown_cameras)}; LIBERO has {', '.join(camera_names)}")
         model.mat_reflectance[:] = 0  # no renderer draws reflections
-        self._burners = [n for n in range(model.nsite) if model.site(n).name.endswith(BURNER)]
-        self._knobs = [
-            model.jnt_qposadr[model.joint(f"{model.site(n).name.removesuffix(BURNER)}_button").id]
-            for n in self._burners
-        ]
+        burners = [site for site in map(model.site, range(model.nsite)) if site.name.endswith(BURNER)]
+        self._knobs = {  # burner → where the state has its knob
+            site.id: model.joint(f"{site.name.removesuffix(BURNER)}_button").qposadr[0] for site in burners
+        }
         model.site_rgba[:, 3] = 0  # sites only mark regions
         self._colours, self._materials = model.mat_rgba.copy(), _materials(model, task)
         cameras = [camera_names.index(name) for name in spec.cameras]
@@ -234,7 +233,7 @@ class Scene:
 
     def pictures(self, mirror: bool) -> Array:
         """Draw every camera's picture (cameras, H, W, 3) uint8."""
-        for burner, knob in zip(self._burners, self._knobs, strict=True):
+        for burner, knob in self._knobs.items():
             glow = float(self.data.qpos[knob] >= 0.5)
             self._renderer.changed |= bool(self.model.site_rgba[burner, 3] != glow)
             self.model.site_rgba[burner, 3] = glow

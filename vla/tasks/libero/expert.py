@@ -48,14 +48,8 @@ class Planner:
         """Do nothing: the planner has no state."""
 
     def act(self, observation: Observation) -> Array:
-        """Return the (7,) float32 action.
-
-        Raises:
-            UserError: the observation lacks the simulator's truth.
-        """
-        truth = observation.truth
-        if truth is None:
-            raise UserError("expert=libero needs the simulator's truth, which this observation lacks")
+        """Return the (7,) float32 action (UserError: the observation lacks the simulator's truth)."""
+        truth = observation.require_truth("expert=libero")
         key = tuple(int(number) for number in truth["task"])
         if key not in self._known:
             self._known[key] = Situation(tasks_of(ALL[key[0]])[key[1]])

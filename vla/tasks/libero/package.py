@@ -106,14 +106,12 @@ def tasks_of(suite: str) -> tuple[Task, ...]:
     Raises:
         UserError: there is no such suite.
     """
-    suites = json.loads(_archive()["tasks.json"])
-    kind, _, change = suite.partition("_")
-    if kind not in SUITES or (change and change not in CHANGES):
+    if suite not in ALL:
         raise UserError(
             f"LIBERO has no suite {suite!r}: it has {', '.join(SUITES)}, and LIBERO-PRO each of them with "
             f"{', '.join('_' + name for name in CHANGES)}"
         )
-    entries = suites[f"libero_{'10' if kind == 'long' else kind}{'_' + change if change else ''}"]
+    entries = json.loads(_archive()["tasks.json"])[f"libero_{suite.replace('long', '10')}"]
     tasks = [{**entry, "suite": suite, "number": number} for number, entry in enumerate(entries)]
     return parse_plain(tasks, tuple[Task, ...], str(SCENES))
 

@@ -13,6 +13,7 @@ from vla.tasks.libero.goal import Goal
 from vla.tasks.libero.package import Task
 from vla.tasks.libero.scene import load_scene
 from vla.tasks.libero.starts import Start, set_start
+from vla.tasks.rendering.shapes import mesh_triangles
 
 SPACING = 0.015  # between points on surfaces [m]
 CUBE = 0.012  # voxel size to which the points of obstacles are thinned [m]
@@ -153,8 +154,7 @@ class Situation:
             if self.goal.owner[body] != root:
                 continue
             if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
-                address = model.mesh_vertadr[model.geom_dataid[geom]]
-                points = model.mesh_vert[address : address + model.mesh_vertnum[model.geom_dataid[geom]]]
+                points = mesh_triangles(model, int(model.geom_dataid[geom]))[0]
             else:
                 round_ = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER
                 points = _surface(model.geom_size[geom][[0, 0, 1]] if round_ else model.geom_size[geom])

@@ -106,7 +106,6 @@ class MetaWorld(ManyTasks):
         )
         self._sentences, self._steps = sentences, steps
         self._make_scene = partial(TaskScene, spec=self.spec, renderer=renderer, drawn=drawn, shadows=shadows)
-        self.tool: Array = np.zeros(3)
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of `seed`."""

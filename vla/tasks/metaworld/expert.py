@@ -33,8 +33,7 @@ class Scripted:
 
     def act(self, observation: Observation) -> Array:
         """Return the (4,) float32 action of the expert (UserError: the observation lacks the simulator's truth)."""
-        if observation.truth is None:
-            raise UserError("expert=metaworld needs the simulator's truth, which this observation lacks")
+        truth = observation.require_truth("expert=metaworld")
         if self._expert is None:
-            self._expert = ENV_POLICY_MAP[self._names[int(observation.truth["task"][0])] + VERSION]()
-        return action_of(np.asarray(self._expert.get_action(observation.truth["observation"])))
+            self._expert = ENV_POLICY_MAP[self._names[int(truth["task"][0])] + VERSION]()
+        return action_of(np.asarray(self._expert.get_action(truth["observation"])))

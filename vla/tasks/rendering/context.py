@@ -33,14 +33,13 @@ class Context:
         self.gl: Any = moderngl.create_standalone_context(**BACKEND)
         self.gl.gc_mode = "context_gc"  # objects must not be freed while another context is current
         self.gl.depth_func = "<="
-        self._lock, self._user = Lock(), 0
+        self._lock = Lock()
 
     @contextmanager
-    def used_by(self, renderer: object) -> Iterator[bool]:
-        """Make the context current; yield whether another renderer may have changed its bindings since the last use."""
+    def current(self) -> Iterator[None]:
+        """Make the context current; other renderers may have changed its bindings."""
         with self._lock, self.gl:
-            changed, self._user = self._user != id(renderer), id(renderer)
-            yield changed
+            yield
 
     def depth_renderbuffer(self, size: tuple[int, int]) -> Any:
         """Make a float32 depth buffer (width, height) in the current context, which is read without conversion.
@@ -64,9 +63,8 @@ class Context:
 
     def clean(self) -> None:
         """Free the objects that nobody refers to any more."""
-        with self._lock, self.gl:
+        with self.current():
             self.gl.gc()
-            self._user = 0
 
 
 @cache

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import moderngl
 import mujoco
@@ -52,6 +52,7 @@ class Fast:
     samples: Literal[1, 4]  # per pixel, which are averaged; 4 draws twice as many rows and columns, for smooth edges
     soft: Annotated[int, Ge(0), Le(4)]  # texels around the nearest one over which the edges of shadows are averaged
     faces: Annotated[int, Ge(100)] | None  # most faces of a mesh, heavier ones are decimated for pictures; None: all
+    coarser: ClassVar[int] = 0  # mipmap levels by which textures are coarser than needed
 
     @staticmethod
     def substitute() -> tuple[str, str] | None:
@@ -62,38 +63,31 @@ class Fast:
 
     def open(self, model: mujoco.MjModel, views: Views) -> Renderer:
         """Make a renderer of `model`; a UserError without EGL: no other replaces it, as stores name their renderer."""
-        return FastRenderer(_context(), model, views, self)
+        try:
+            context = shared_context()
+        except Exception as error:  # moderngl raises plain exceptions
+            raise UserError(
+                f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages "
+                f"{PACKAGES}, or choose task/renderer=mujoco"
+            ) from error
+        return FastRenderer(context, model, views, self)
 
 
-@dataclass(frozen=True)
-class Detailed:
+class Detailed(Fast):
     """Factory of the fast renderer with all faces, four samples per pixel, and textures as coarse as in MuJoCo, which
     looks a texture up once per pixel, not once per sample."""
 
-    substitute = staticmethod(Fast.substitute)
+    coarser = 1
 
-    def open(self, model: mujoco.MjModel, views: Views) -> Renderer:
-        """Make a renderer of `model`, or raise as `Fast.open`."""
-        return FastRenderer(_context(), model, views, Fast(samples=4, soft=0, faces=None), coarser=1)
-
-
-def _context() -> Context:
-    try:
-        return shared_context()
-    except Exception as error:  # moderngl raises plain exceptions
-        raise UserError(
-            f"the fast renderer needs EGL, which this machine lacks ({error}): install the packages "
-            f"{PACKAGES}, or choose task/renderer=mujoco"
-        ) from error
+    def __init__(self) -> None:
+        super().__init__(samples=4, soft=0, faces=None)
 
 
 class FastRenderer:
     """Pictures of one model by OpenGL 3.3."""
 
-    def __init__(self, context: Context, model: mujoco.MjModel, views: Views, settings: Fast, coarser: int = 0) -> None:
-        """Take context, model, views, settings, and the mipmap levels by which textures are coarser than needed."""
-        self._context, self._gl, self._settings, self._coarser = context, context.gl, settings, coarser
-        self._model, self._views = model, views
+    def __init__(self, context: Context, model: mujoco.MjModel, views: Views, settings: Fast) -> None:
+        self._context, self._gl, self._model, self._views, self._settings = context, context.gl, model, views, settings
         self._cameras = ModelCameras(model, views)
         if missing_features := unsupported(model, views):
             log.warning(f"the fast renderer leaves out {', '.join(missing_features)}; task/renderer=mujoco draws them")
@@ -102,7 +96,7 @@ class FastRenderer:
         self._geometry = Geometry(model, self._mesh)
         casts_shadow = model.light_castshadow if model.vis.quality.shadowsize else np.zeros(model.nlight, bool)
         self._lamps = [int(light) for light in uniforms.drawn_lights(model) if casts_shadow[light]]
-        with context.used_by(self):
+        with context.current():
             self._make_targets()
             self._shadows = Shadows(self._gl, model, self._lamps, settings.soft)
             self._make_tables()
@@ -132,7 +126,6 @@ class FastRenderer:
         count = self._model.ngeom + self._model.nsite + 1  # the last one is the sky
         self._poses = np.zeros((count, shaders.POSE, 4), np.float32)
         self._poses[-1] = np.eye(3, 4)
-        self._table = np.zeros((count, shaders.TEXELS, 4), np.float32)
         self._pose_texture = self._gl.texture((shaders.POSE, count), 4, dtype="f4")
         self._table_texture = self._gl.texture((shaders.TEXELS, count), 4, dtype="f4")
         for texture in (self._pose_texture, self._table_texture):
@@ -145,24 +138,18 @@ class FastRenderer:
         pixel = bool(is_spot[lights].any())  # light at vertices, as in MuJoCo, would miss the edge of a spot
         lamps = {1 + lights.index(lamp): bool(is_spot[lamp]) for lamp in self._lamps}
         kinds: tuple[shaders.Skin, ...] = ("none", "2d", "cube")
+        options = pixel, settings.soft, settings.coarser
         self._programs = {
-            kind: gl.program(**shaders.scene_program(1 + len(lights), lamps, kind, pixel, settings.soft, self._coarser))
-            for kind in kinds
+            kind: gl.program(**shaders.scene_program(1 + len(lights), lamps, kind, *options)) for kind in kinds
         }
         units = {"poses": self._pose_texture, "table": self._table_texture}
         units |= {f"shadow{number}": depth for number, depth in enumerate(self._shadows.maps)}
         self._units = list(units.values())
-        self._bind()
         self._skin = len(units)  # unit of the texture of the element being drawn
         for unit, name in enumerate((*units, "skin")):
             for program in (*self._programs.values(), self._shadows.program):
                 if name in program:
                     program[name] = unit
-
-    def _bind(self) -> None:
-        """Bind the textures that all programs read to their units, which another renderer may have used."""
-        for unit, texture in enumerate(self._units):
-            texture.use(unit)
 
     def _make_buffers(self) -> None:
         """Make the buffer of all geometry, and a vertex array per program, without the attributes it does not use."""
@@ -177,10 +164,8 @@ class FastRenderer:
 
     def update(self, textures: Collection[int] = ()) -> None:
         """Upload what has changed in the model; `textures` are the ids of textures with changed pixels."""
-        with self._context.used_by(self) as changed:
-            if changed:
-                self._bind()
-            self._textures.upload(set(textures))
+        with self._context.current():
+            self._textures.upload(textures)
             elements = self._elements = elements_of(self._model, self._views)
             self._planes = np.flatnonzero(elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE)).tolist()
             self._geometry.update(elements, self._sky >= 0)
@@ -189,10 +174,7 @@ class FastRenderer:
             self._uniforms.stale = True
             sites = np.linalg.norm(elements.size[self._model.ngeom :], axis=1)
             self._bounds = np.append(self._model.geom_rbound, sites)  # radius of each element [m]
-            table = self._new_table(elements)
-            if not np.array_equal(table, self._table):
-                self._table = table
-                self._table_texture.write(table)
+            self._table_texture.write(self._table(elements))
 
     def _place_elements(self) -> None:
         """Upload the elements' triangles, and store their places in the buffer."""
@@ -225,9 +207,9 @@ class FastRenderer:
             self._textures.placed[call.texture].use(self._skin)
         self._scene[self._kind(call.texture)].render(moderngl.TRIANGLES, vertices=call.count, first=call.start)
 
-    def _new_table(self, elements: Elements) -> Array:
+    def _table(self, elements: Elements) -> Array:
         """Return (E + 1, TEXELS, 4) float32, the appearance of all elements and the sky."""
-        table = np.zeros_like(self._table)
+        table = np.zeros((len(elements.kind) + 1, shaders.TEXELS, 4), np.float32)
         table[:-1, 0], table[:-1, 1, :3] = elements.rgba, elements.light
         table[:-1, 1, 2] *= 128  # shininess, the exponent
         for plane in self._planes:
@@ -240,9 +222,9 @@ class FastRenderer:
 
     def render(self, data: mujoco.MjData, windows: Array | None = None) -> tuple[Array, Array]:
         """Draw colours (cameras, H, W, 3) uint8 and depth (cameras, H, W) float32 [m]."""
-        with self._context.used_by(self) as changed:
-            if changed:
-                self._bind()
+        with self._context.current():
+            for unit, texture in enumerate(self._units):  # another renderer may have bound its own
+                texture.use(unit)
             self._upload_poses(data)
             self._uniforms.update(data, windows, self._shadows)
             self._shadows.cast(self._poses)
@@ -258,8 +240,7 @@ class FastRenderer:
     def _upload_poses(self, data: mujoco.MjData) -> None:
         geoms, poses = self._model.ngeom, self._poses
         poses[:geoms, :, :3], poses[:geoms, :, 3] = data.geom_xmat.reshape(-1, 3, 3), data.geom_xpos
-        if self._views.site_groups:
-            poses[geoms:-1, :, :3], poses[geoms:-1, :, 3] = data.site_xmat.reshape(-1, 3, 3), data.site_xpos
+        poses[geoms:-1, :, :3], poses[geoms:-1, :, 3] = data.site_xmat.reshape(-1, 3, 3), data.site_xpos
         self._pose_texture.write(poses)
 
     def _aim(self, number: int) -> None:
@@ -345,13 +326,12 @@ class FastRenderer:
     def _metres(self, reading: Array) -> Array:
         """Convert readings of the depth buffer, 0 at the near plane and 1 at the far one, to depth [m], in place."""
         near, far = clip_range(self._model)
-        background = reading >= 1 if reading.max() >= 1 else None
-        depth = np.multiply(reading, near - far, out=reading)
-        depth += far
-        np.divide(near * far, depth, out=depth)
-        if background is not None:
-            np.copyto(depth, 0.0, where=background)
-        return depth
+        background = reading >= 1
+        reading *= near - far
+        reading += far
+        np.divide(near * far, reading, out=reading)
+        reading[background] = 0.0
+        return reading
 
     def close(self) -> None:
         """Free the renderer's GL objects."""

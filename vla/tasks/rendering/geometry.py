@@ -98,28 +98,20 @@ class Part:
     vertices: Array  # (V, floats of a vertex) float32
     triangles: Array  # (T, 3) int32, from 0
 
-    def fits(self, other: Part) -> bool:
-        """Return whether another part has as many vertices and the same triangles."""
-        same_size = len(self.vertices) == len(other.vertices)
-        return self is other or (same_size and np.array_equal(self.triangles, other.triangles))
-
 
 class Buffers:
-    """Vertices and indices of all elements, one after the other, uploaded again only where they have changed."""
+    """Vertices and indices of all elements, one after the other, uploaded again only if one has changed."""
 
     def __init__(self, gl: Any) -> None:
         self.vertices, self.indices = gl.buffer(reserve=4), gl.buffer(reserve=4)
         self._parts: list[Part] = []
 
     def update(self, parts: Sequence[Part]) -> None:
-        """Write the parts that have changed, or all of them where their layout has."""
-        old_parts, self._parts = self._parts, list(parts)
-        starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-        if len(old_parts) == len(parts) and all(old.fits(part) for old, part in zip(old_parts, parts, strict=True)):
-            for old, part, start in zip(old_parts, parts, starts, strict=False):
-                if old is not part:
-                    self.vertices.write(part.vertices, offset=int(start) * part.vertices[0].nbytes)
-        elif parts:
+        """Write the parts, unless they are the same objects as the last time."""
+        changed = [*map(id, parts)] != [*map(id, self._parts)]
+        self._parts = list(parts)
+        if changed and parts:
+            starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
             indices = [part.triangles + start for part, start in zip(parts, starts, strict=False)]
             content = np.concatenate([part.vertices for part in parts]), np.concatenate(indices, dtype=np.int32)
             for buffer, values in zip((self.vertices, self.indices), content, strict=True):

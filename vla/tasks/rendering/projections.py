@@ -75,29 +75,24 @@ class ModelCameras:
 
     def update(self) -> None:
         """Read the projections of the cameras from the model."""
-        self._whole = np.stack([self._lens(camera) for camera in self.ids])
-        self._show(None)
-
-    def _show(self, windows: Array | None) -> None:
-        """Set the crop of each camera's field of view, (cameras, 4), see `Renderer.render`."""
-        lenses = self._whole if windows is None else _enlargements(windows) @ self._whole
-        self._lenses, self._windows = UPSIDE_DOWN @ lenses, windows
-        x, y, z, w = self._lenses.swapaxes(0, 1)
-        sides = np.stack([w + x, w - x, w + y, w - y, w + z], axis=1)
-        self._sides = sides / np.linalg.norm(sides[:, :, :3], axis=2, keepdims=True)  # of the frustums, looking inwards
+        self._lenses = np.stack([self._lens(camera) for camera in self.ids])
 
     def place(self, data: mujoco.MjData, windows: Array | None) -> Array:
-        """Read the poses of the cameras from a state; return the projections (cameras, 4, 4) of the world."""
-        if windows is not None or self._windows is not None:
-            self._show(windows)
+        """Read the poses of the cameras from a state; return the projections (cameras, 4, 4) of the world.
+
+        For `windows` see `Renderer.render`.
+        """
         self.eyes, self.axes = data.cam_xpos[self.ids], data.cam_xmat[self.ids].reshape(-1, 3, 3)
-        poses = inverse_pose(self.eyes, self.axes.swapaxes(1, 2))
-        self._world_sides = self._sides @ poses
-        return self._lenses @ poses
+        lenses = self._lenses if windows is None else _enlargements(windows) @ self._lenses
+        projections = UPSIDE_DOWN @ lenses @ inverse_pose(self.eyes, self.axes.swapaxes(1, 2))
+        x, y, z, w = projections.swapaxes(0, 1)
+        sides = np.stack([w + x, w - x, w + y, w - y, w + z], axis=1)
+        self._sides = sides / np.linalg.norm(sides[:, :, :3], axis=2, keepdims=True)  # of the frustums, looking inwards
+        return projections
 
     def may_see(self, centres: Array, radii: Array) -> Array:
         """Return which spheres at `centres` (N, 3), of `radii` (N,) [m], reach into a picture: (cameras, N) bool."""
-        distances = self._world_sides[:, :, :3] @ centres.T + self._world_sides[:, :, 3:]
+        distances = self._sides[:, :, :3] @ centres.T + self._sides[:, :, 3:]
         return (distances > -radii).all(axis=1)
 
     def behind(self, number: int, plane: Array) -> bool:

@@ -33,7 +33,6 @@ class Renderer(Protocol):
         Args:
             textures: ids of textures whose pixels have changed; all other changes are found by comparison.
         """
-        ...
 
     def render(self, data: mujoco.MjData, windows: Array | None = None) -> tuple[Array, Array]:
         """Draw every camera's picture of a state.
@@ -47,11 +46,9 @@ class Renderer(Protocol):
             Colours (cameras, height, width, 3) uint8, and depth along the optical axis (cameras, height, width)
             float32 [m], 0 where nothing is; a sky counts, at 0.7 to 1 times the distance of the far clipping plane.
         """
-        ...
 
     def close(self) -> None:
         """Free the renderer's GL objects."""
-        ...
 
 
 class RendererFactory(Protocol):
@@ -59,7 +56,6 @@ class RendererFactory(Protocol):
 
     def open(self, model: mujoco.MjModel, views: Views) -> Renderer:
         """Make a renderer of `model`."""
-        ...
 
 
 class LazyRenderer:

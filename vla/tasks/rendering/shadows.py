@@ -44,7 +44,6 @@ class Shadows:
         is_static = (model.body_weldid == 0) & (model.body_mocapid < 0)
         self._fixed = np.flatnonzero(np.append(is_static[model.geom_bodyid], is_static[model.site_bodyid]))  # elements
         self._state: bytes | None = None  # poses of the static elements in their maps
-        self._written = -1  # number of the lamp whose uniforms the program has
 
     def _target(self) -> Any:
         """Make the framebuffer of a map, with an unused colour attachment: without one moderngl copies nothing."""
@@ -73,7 +72,7 @@ class Shadows:
             {"projection": projection.T.astype(np.float32).tobytes(), "lamp": lamp.astype(np.float32).tobytes()}
             for projection, lamp in zip(projections, lamps, strict=True)
         ]
-        self._state, self._written = None, -1
+        self._state = None
 
     def cast(self, poses: Array) -> None:
         """Draw the maps; `poses` are those of the elements (E, 3, 4)."""
@@ -82,11 +81,9 @@ class Shadows:
         stale, self._state = state != self._state, state
         gl.front_face = "ccw"
         gl.polygon_offset = SLOPE + 2.0 * self._soft, UNITS  # averages reach across texels
-        for number, (static_target, target) in enumerate(zip(self._static_targets, self._targets, strict=True)):
-            if number != self._written:
-                for name, content in self._uniforms[number].items():
-                    self.program[name].write(content)
-                self._written = number
+        for uniforms, static_target, target in zip(self._uniforms, self._static_targets, self._targets, strict=True):
+            for name, content in uniforms.items():
+                self.program[name].write(content)
             if stale:
                 static_target.viewport = 0, 0, self._edge, self._edge
                 static_target.clear(depth=1.0)

@@ -31,7 +31,7 @@ class Textures:
 
     def upload(self, textures: Collection[int]) -> None:
         """Upload the pixels of textures, given by their ids in the model."""
-        for number in sorted({int(texture) for texture in textures} & set(self.placed)):
+        for number in sorted({*textures} & {*self.placed}):
             texture, pixels = self.placed[number], self._pixels(number)
             if isinstance(texture, moderngl.TextureCube):
                 width = texture.size[0]

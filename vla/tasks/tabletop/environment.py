@@ -99,8 +99,7 @@ class Tabletop(World):
             truth=(("tcp", 3), ("block", 3), ("destination", 3), ("faces", 2)),
             robot=arm,
         )
-        bounds = np.array(self.spec.low), np.array(self.spec.high)
-        self.simulation = Simulation(goal, randomize, scene, *bounds, time_limit)
+        self.simulation = Simulation(goal, randomize, scene, self.spec, time_limit)
         views = Views([scene.cameras[name] for name in cameras], *self.spec.image_size, geom_groups=(VISIBLE,))
         self.renderer = LazyRenderer(renderer, scene.model, views, scene.stale_textures)
 
@@ -138,15 +137,11 @@ class Tabletop(World):
         return self.look()
 
     def drive(self, joints: Array, opening: float, seconds: float) -> None:
-        """Move towards joints (J,) [rad] and a gripper opening 0…1 for `seconds`; call `judge` once per control period.
-
-        Raises:
-            UserError: `seconds` is no whole number of physics steps.
-        """
+        """See `TakesJointTargets`."""
         self.simulation.follow(joints, opening, seconds)
 
     def judge(self) -> None:
-        """Update the outcome after one control period of driving; this may end the episode."""
+        """See `TakesJointTargets`."""
         self.simulation.judge()
         self._update_outcome(self.simulation.over)
 

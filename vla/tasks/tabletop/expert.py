@@ -53,10 +53,9 @@ class Waypoint:
 
     def act(self, observation: Observation) -> Array:
         """Return the (7,) action for this state (UserError: the observation lacks the simulator's truth)."""
-        if observation.truth is None:
-            raise UserError("the scripted expert needs the simulator's truth, which this observation lacks")
+        truth = observation.require_truth("the scripted expert")
         self.info = {}
-        action = self._decide(observation.truth, float(observation.state[self._gripper]))
+        action = self._decide(truth, float(observation.state[self._gripper]))
         return np.clip(action, self._low, self._high).astype(np.float32)
 
     def _decide(self, truth: dict[str, Array], opening: float) -> Array:

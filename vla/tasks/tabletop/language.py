@@ -25,7 +25,7 @@ class Grammar:
     """Phrasings with slots: the goal fills {block}, a random synonym fills {put}.
 
     Held out from training, for evaluation only: some synonyms, some phrasings, and some colours of the named block
-    (UserError: a held-out part is empty, replaces nothing or overlaps with training, or a slot is malformed).
+    (UserError: a held-out part replaces nothing or overlaps with training, or a slot is malformed).
     """
 
     phrasings: Phrasings
@@ -40,8 +40,6 @@ class Grammar:
         overlap |= {word for slot, terms in held_out.items() for word in terms if word in words.get(slot, ())}
         if overlap:
             raise UserError(f"task.goal.language holds out what training also uses: {sorted(overlap)}")
-        if not self.held_out_phrasings or not held_out:
-            raise UserError("task.goal.language.held_out_phrasings and held_out_words must not be empty")
         if not any(f"{{{slot}}}" in phrasing for phrasing in self.phrasings for slot in held_out):
             raise UserError("task.goal.language.held_out_words has no slot of the phrasings, so it replaces no word")
         phrasings = (*self.phrasings, *self.held_out_phrasings)

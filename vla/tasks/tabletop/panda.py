@@ -78,7 +78,7 @@ class Panda(TabletopRobot):
     closed, opened = np.zeros(1), np.array([panda.FINGER_TRAVEL])
     travel, finger_speed, widest = panda.FINGER_TRAVEL, panda.FINGER_SPEED, panda.MAX_OPENING
 
-    def __init__(self, meshes: Literal["light", "full"] = "light") -> None:
+    def __init__(self, meshes: Literal["light", "full"]) -> None:
         """Choose the visual meshes, "light" (1 200 faces) or "full" (134 000). Collision meshes are the same."""
         self._meshes = meshes
 

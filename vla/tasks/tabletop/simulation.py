@@ -12,7 +12,7 @@ import numpy as np
 
 from vla.io.errors import UserError
 from vla.robots.cartesian import CartesianController, solve
-from vla.spec import FIRST_SEED, Array
+from vla.spec import FIRST_SEED, Array, Spec
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.disturber import PUSH_STEP, Disturber
 from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState, current
@@ -52,27 +52,15 @@ class Simulation:
         goal: Goal | Mixed | Chain,
         randomize: Mapping[str, Randomizer | None],
         compiled: CompiledScene,
-        low: Array,
-        high: Array,
+        spec: Spec,
         time_limit: float,
     ) -> None:
-        """Store the parts; no episode has begun.
-
-        Args:
-            goal: goal, mixture of goals, or chain of goals.
-            randomize: axis name → randomizer, or None to disable the axis.
-            compiled: the compiled scene.
-            low: lower bounds (7,) of an action.
-            high: upper bounds (7,) of an action.
-            time_limit: time for an instruction, per block to be moved [s].
-        """
+        """Store the parts, as in `Tabletop`; no episode has begun."""
         self.goals, self.randomize, self.compiled = goal, randomize, compiled
-        self._low, self._high, self._time_limit = low, high, time_limit
+        self._spec, self._time_limit = spec, time_limit
         self._timestep = compiled.model.opt.timestep
         self.substeps = round(1 / CONTROL_HZ / self._timestep)
         self.controller = CartesianController(compiled.robot.kinematics, 1 / CONTROL_HZ, *WORKSPACE)
-        self.draws: dict[str, Any] = {}
-        self.instruction = ""
         self.disturber: Disturber | None = None
         self.streams = Streams()
 
@@ -205,11 +193,10 @@ class Simulation:
 
     def step(self, action: Array) -> None:
         """Simulate one control period, with targets interpolated linearly to those of the (7,) action."""
-        action = np.clip(action, self._low, self._high)
+        action = np.clip(action, self._spec.low, self._spec.high)
         if self.disturber:
             action = self.disturber.override(action)
-        furthest = self.compiled.robot.finger_speed / CONTROL_HZ
-        self._advance(self.controller.step(action[:6]), action[6], furthest, self.substeps)
+        self._advance(self.controller.step(action[:6]), action[6], self.substeps)
         self.judge()
 
     def follow(self, joints: Array, opening: float, seconds: float) -> None:
@@ -228,7 +215,7 @@ class Simulation:
             )
         if self.disturber:
             joints, opening = self._disturb(self.disturber, joints, opening, seconds)
-        self._advance(joints, opening, self.compiled.robot.finger_speed * substeps * self._timestep, substeps)
+        self._advance(joints, opening, substeps)
 
     def _disturb(self, disturber: Disturber, joints: Array, opening: float, seconds: float) -> tuple[Array, float]:
         """Return joint targets and opening under the disturbance; the tool is pushed no faster than by an action."""
@@ -242,10 +229,10 @@ class Simulation:
             joints = solve(kinematics, target, joints, start)
         return joints, 1.0 if disturber.opens else opening
 
-    def _advance(self, joints: Array, opening: float, furthest: float, substeps: int) -> None:
-        """Step physics with targets interpolated to joints [rad] and to an opening 0…1, at most `furthest` away."""
+    def _advance(self, joints: Array, opening: float, substeps: int) -> None:
+        """Step physics with targets interpolated to joints [rad] and, as fast as fingers are, to an opening 0…1."""
         model, data, robot = self.compiled.model, self.compiled.data, self.compiled.robot
-        grip = self._command[-1]
+        grip, furthest = self._command[-1], robot.finger_speed * substeps * self._timestep
         finger = grip + np.clip(opening * robot.travel - grip, -furthest, furthest)
         increment = (np.append(joints, finger) - self._command) / substeps
         commands = self._command + np.arange(1, substeps + 1)[:, None] * increment

@@ -30,7 +30,6 @@ class Randomizer(Protocol):
 
     def __call__(self, scene: CompiledScene, random_state: np.random.RandomState) -> dict[str, Any]:
         """Sample, write the sample into the compiled model or the state, and return it as plain values."""
-        ...
 
 
 def rounded(values: Array) -> list[Any]:
