@@ -50,7 +50,8 @@ def collect(experiment: Experiment) -> dict[str, Measure]:
     times |= {"expert, controller, judge": blind - physics, "images into arrays": full - blind - rendering}
     for name, seconds in times.items():
         measures[f"collect: {name}"] = measure(1000 * seconds / steps, "ms/step", steps, whole)
-    measures |= _renderers(experiment)
+    if "rendering" in times:
+        measures |= _renderers(experiment)
     work = partial(DemonstrationWorker, *makers)
     single_rate, total_rate = (_verified_rate(work, processes, count) for processes in (1, cores()))
     measures[f"collect: {cores()} processes"] = measure(total_rate, unit, steps, cores() * single_rate)
@@ -85,7 +86,10 @@ def _keep(store: EpisodeStore, episodes: list[Episode]) -> None:
 
 
 def _renderers(experiment: Experiment) -> dict[str, Measure]:
-    """Measure the rendering of a step by every renderer of the task in turns; "chosen" is one with custom settings."""
+    """Measure the rendering of a step by every renderer of a task with `minimal_step`, in turns.
+
+    "chosen" is one with custom settings.
+    """
     renderer, options = experiment["task"].get("renderer"), _options()
     if renderer is None or renderer["_target_"] not in [node["_target_"] for node in options.values()]:
         return {}
