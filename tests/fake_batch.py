@@ -24,14 +24,14 @@ from vla.models.text.ngrams import NGrams
 from vla.models.tokenizers.tokenizer import Uniform
 from vla.models.vision.image_tokenizer import FilmConv
 from vla.policy import Policy
-from vla.spec import Spec
+from vla.spec import ActionStatistics, Spec
 
 TINY_IMAGE = partial(FilmConv, [8, 8], [5, 3], [2, 1], chroma=True, positions=False)
 OF_CONTEXT = ("history", "learned_tokens", "keypoints", "proprioception")
 TINY_TEXT = partial(NGrams, **defaults_of("model/text/ngrams", vocabulary=64, dropout=0.0))
 
 
-class Motions:
+class Motions(ActionStatistics):
     """Statistics of smooth motions, mostly small, with a gripper that closes on the way, as of a store of them."""
 
     def __init__(self, steps: int = 4000, seed: int = 0) -> None:
@@ -39,8 +39,8 @@ class Motions:
         moves = np.convolve(random.laplace(0, 0.012, 2 * steps + 18), np.hanning(11)[1:-1] / 5, "valid")
         moves = np.clip(moves[: 2 * steps].reshape(2, steps).T, -0.05, 0.05)
         closed = np.sin(np.arange(steps) / 9) > 0.3
-        self.actions = np.concatenate([moves, 1.0 - closed[:, None]], 1).astype(np.float32)
-        self.low, self.high = self.actions.min(0), self.actions.max(0)
+        actions = np.concatenate([moves, 1.0 - closed[:, None]], 1).astype(np.float32)
+        super().__init__(actions, np.array([steps]))
 
     def chunks(self, length: int) -> np.ndarray:
         """Every chunk there is."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from defaults import defaults_of
-from fake_batch import MOTIONS, Motions
+from fake_batch import MOTIONS
 from saved_policies import save_policy
 from toy import SPEC
 
@@ -22,18 +22,15 @@ from vla.models.policy_folder import read_policy
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile
 from vla.models.tokenizers.tokenizer import ActionTokenizer, PerComponent, RT1Bins, Uniform, out_of_bounds, rounding
+from vla.spec import ActionStatistics
 
 
-@dataclass(frozen=True)
-class Bounds:
-    low: np.ndarray
-    high: np.ndarray
-
-    def chunks(self, length: int) -> np.ndarray:
-        return np.linspace(self.low, self.high, 999, dtype=np.float32)[:, None].repeat(length, 1)
+def between(low: list[float], high: list[float]) -> ActionStatistics:
+    """Statistics of actions that are spread evenly between two."""
+    return ActionStatistics(np.linspace(low, high, 999, dtype=np.float32), np.array([999]))
 
 
-BOUNDS = Bounds(np.array([-0.02, -0.01, 0.0]), np.array([0.03, 0.04, 1.0]))
+BOUNDS = between([-0.02, -0.01, 0.0], [0.03, 0.04, 1.0])
 
 
 def tokenizers() -> list[PerComponent]:
@@ -67,7 +64,7 @@ def test_uniform_rounds_without_bias() -> None:
 
 
 def test_a_component_that_never_changes_in_the_data_still_has_bins() -> None:
-    constant = Bounds(np.array([0.0, 0.01, 1.0]), np.array([0.0, 0.01, 1.0]))
+    constant = between([0.0, 0.01, 1.0], [0.0, 0.01, 1.0])
     tokenizer = Uniform(spec=SPEC, statistics=constant, **defaults_of("tokenizer/uniform"))
     assert (tokenizer.high > tokenizer.low).all()
     action = torch.tensor([0.0, 0.01, 1.0])
@@ -223,9 +220,7 @@ def test_quantile_bins_hold_as_many_actions_each_and_are_read_as_their_mean() ->
 
 def test_values_that_occur_often_are_one_bin_each() -> None:
     actions = np.array([[-0.05, 0.01, 0.0]] * 50 + [[0.02, 0.01, 1.0]] * 30 + [[0.05, 0.01, 1.0]] * 20, np.float32)
-    statistics = Motions()
-    statistics.actions, statistics.low, statistics.high = actions, actions.min(0), actions.max(0)
-    tokenizer = Quantile(bins=32, spec=SPEC, statistics=statistics)
+    tokenizer = Quantile(bins=32, spec=SPEC, statistics=ActionStatistics(actions, np.array([len(actions)])))
     tokens = tokenizer.encode(torch.from_numpy(actions))
     assert [len(column.unique()) for column in tokens.T] == [3, 1, 2]
     assert torch.allclose(tokenizer.decode(tokens), torch.from_numpy(actions), atol=1e-7)

@@ -12,6 +12,7 @@ from arm import ARM, FORWARD, ROBOT, SAFETY, SPEC
 
 from vla.deploy.control_loop import REPEATED, ControlLoop
 from vla.deploy.motion import LEEWAY, Command
+from vla.deploy.observer import Measured
 from vla.deploy.safety import Safety, State
 from vla.robots.panda import HOME, JOINT_HIGH, forward
 from vla.spec import Observation
@@ -34,10 +35,10 @@ class World:
         for tick in range(round(seconds * 50)):
             self.now += 0.02
             if self.measures:
-                self.loop.on_joint_state(self.joints, np.zeros_like(self.joints), 0.08, self.now)
+                self.loop.observer.add_joint_state(Measured(self.now, self.joints, np.zeros_like(self.joints), 0.08))
             if tick % 5 == 0:
                 for camera in self.cameras:
-                    self.loop.on_image(camera, IMAGE, self.now - (self.apart if camera == "wrist" else 0.0))
+                    self.loop.observer.add_image(camera, IMAGE, self.now - (self.apart if camera == "wrist" else 0.0))
             observation = self.loop.next_observation(self.now)
             if observation is not None:
                 actions = self.answer(observation)
@@ -101,7 +102,7 @@ def test_whether_the_arm_follows_a_plan_is_told(world: World) -> None:
 def test_an_arm_is_not_taken_over_where_it_was_long_ago() -> None:
     world = World()
     world.measures = False
-    world.loop.on_joint_state(HOME + 0.1, np.zeros(7), 0.08, world.now - SAFETY.joints_age)
+    world.loop.observer.add_joint_state(Measured(world.now - SAFETY.joints_age, HOME + 0.1, np.zeros(7), 0.08))
     assert world.run(0.2) == [] and "no joint state within" in world.loop.reason
     world.measures = True
     assert world.run(0.2)[0].position == pytest.approx(HOME)
@@ -213,9 +214,9 @@ def test_a_frame_counts_once_every_camera_has_a_newer_one(world: World) -> None:
 
     def after(*cameras: str) -> State:
         world.now += 0.01
-        world.loop.on_joint_state(world.joints, np.zeros(7), 0.08, world.now)
+        world.loop.observer.add_joint_state(Measured(world.now, world.joints, np.zeros(7), 0.08))
         for camera in cameras:
-            world.loop.on_image(camera, IMAGE, world.now)
+            world.loop.observer.add_image(camera, IMAGE, world.now)
         world.loop.command(world.now)
         return world.loop.state
 
@@ -335,7 +336,12 @@ def test_an_arm_in_the_hands_of_a_person_is_not_commanded_and_goes_on_from_where
             r"panda_joint1 is at 2\.887 rad, outside -2\.847 to 2\.847: move it inside first",
         ),
         (lambda world: setattr(world, "measures", False), "no joint state within"),
-        (lambda world: world.loop.on_joint_state(world.joints + 0.01, np.zeros(7), 0.08, world.now), "still moves"),
+        (
+            lambda world: world.loop.observer.add_joint_state(
+                Measured(world.now, world.joints + 0.01, np.zeros(7), 0.08)
+            ),
+            "still moves",
+        ),
     ],
     ids=["outside", "unseen", "moving"],
 )
@@ -472,7 +478,7 @@ def test_the_horizon_is_continuous_with_the_commands(actions: int, longest: floa
     world.begin()
     sent: list[np.ndarray] = []
     for command in world.ticks(1.0):
-        planned = world.loop.motion.horizon(world.now, longest)
+        _, *planned = world.loop.motion.ahead(command, world.now, longest)
         ahead = [each.position for each in planned]
         assert not planned[-1].velocity.any()
         sent.append(command.position)

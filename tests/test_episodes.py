@@ -60,7 +60,7 @@ def test_statistics_and_samples_are_those_of_all_stored_actions(
     padded = [np.concatenate([actions, actions[-1:].repeat(3, 0)]) for actions in stored]  # chunks stay within episodes
     expected = [each[step : step + 4] for each in padded for step in range(len(each) - 3)]
     np.testing.assert_array_equal(statistics.chunks(4), expected)
-    monkeypatch.setattr("vla.data.statistics.MAX_SAMPLE", 40)
+    monkeypatch.setattr("vla.spec.MAX_SAMPLE", 40)
     few = statistics.chunks(4)
     np.testing.assert_array_equal(few[[0, -1]], [expected[0], expected[-1]])
     assert few.shape == (10, 4, 3)
@@ -74,8 +74,6 @@ def test_a_reader_can_keep_to_the_first_episodes(tmp_path: Path) -> None:
         EpisodeStore(tmp_path, episodes=9)
     empty = add(tmp_path / "empty", [])
     assert empty.episodes == [] and empty.next_seed is None and empty.rows("rgb_front").shape == (0, 16, 16, 3)
-    with pytest.raises(ValueError, match="no episodes yet"):
-        _ = empty.statistics
 
 
 TEARS: dict[str, tuple[float, float, float]] = {  # share of the last episode in one file, in the others, in the index
@@ -180,8 +178,6 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         EpisodeStore(damaged("depth_wrist.bin", lambda data: data[:-1]))
     with pytest.raises(ValueError, match=r"line 2 of .*index\.jsonl does not follow"):
         EpisodeStore(damaged("index.jsonl", lambda data: data.split(b"\n")[0] + b"\n" + data))
-    with pytest.raises(ValueError, match="has no field 'rgb'"):
-        EpisodeStore(whole).rows("rgb")
 
 
 @pytest.mark.parametrize("name", ["index.jsonl", "executed.bin", "rgb_front.bin"])

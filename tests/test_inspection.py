@@ -202,7 +202,7 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"the rows of seed 4 in .* were changed on disk: .* inspect\.repair=true"):
         derive_store([store], tmp_path / "new")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "store"]
-    shutil.copytree(store.folder, tmp_path / ".new.draft")  # as if killed there
+    shutil.copytree(store.folder, tmp_path / ".0123abcd.new")  # as if killed there
     derive_store([EpisodeStore(store.folder, damaged=True)], tmp_path / "new", repair=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "other", "store"]
     (store.folder / "index.jsonl").unlink()

@@ -46,6 +46,7 @@ from vla.data.formats import lerobot_tables as tables
 from vla.data.formats.lerobot_dataset import LeRobotDataset
 from vla.data.formats.lerobot_images import decode, encode, require_video
 from vla.data.formats.lerobot_import import LeRobotDemonstrations
+from vla.data.index import recording_of
 from vla.io.errors import UserError
 from vla.io.parts import Part
 from vla.spec import Spec
@@ -82,7 +83,7 @@ def test_an_import_goes_on_where_it_was(home: Path, tmp_path: Path) -> None:
     imported(home / "dataset", tmp_path / "store", episodes=1)
     imported(home / "dataset", tmp_path / "store")
     assert content(tmp_path / "store") == content(home / "imported")
-    with pytest.raises(ValueError, match=r"only 3 recorded episodes: set collect\.episodes=3"):
+    with pytest.raises(ValueError, match=r"only 3 whole episodes: set collect\.episodes=3"):
         imported(home / "dataset", tmp_path / "store", episodes=4)
 
 
@@ -298,7 +299,7 @@ def test_every_step_has_the_instruction_of_its_task(home: Path, tmp_path: Path, 
     found = imported(dataset, tmp_path / "store", 5)
     assert "episodes: 3 become 5" in caplog.text
     assert [entry.instruction for entry in found.episodes] == ["reach", "grasp", "reach", "grasp", "reach"]
-    assert [entry.recording for entry in found.episodes] == [0, 0, 1, 1, 2]
+    assert [recording_of(entry) for entry in found.episodes] == [0, 0, 1, 1, 2]
     assert [entry.draws["recorded"]["first_step"] for entry in found.episodes] == [0, 4, 0, 4, 0]
     for name in ("state", "action", "executed", "rgb_front"):
         there = np.concatenate([whole.read(entry)[name] for entry in whole.episodes])
@@ -309,7 +310,7 @@ def test_every_step_has_the_instruction_of_its_task(home: Path, tmp_path: Path, 
             there[starts, 7:14] = 0
         np.testing.assert_allclose(here, there, rtol=1e-6)
     for fraction in np.linspace(0, 1, 11):  # what shows the same scene is on the same side
-        sides = [held_out(entry.recording, fraction) for entry in found.episodes]
+        sides = [held_out(recording_of(entry), fraction) for entry in found.episodes]
         assert sides[0] == sides[1] and sides[2] == sides[3]
 
 
@@ -334,7 +335,7 @@ def test_numbers_of_episodes_may_have_holes(home: Path, tmp_path: Path) -> None:
     fewer = info(lambda info: info.update(total_episodes=2, total_frames=2))
     dataset = changed(home, tmp_path / "dataset", without_second, fewer)
     found, whole = imported(dataset, tmp_path / "store", 2), EpisodeStore(home / "imported")
-    assert [(entry.seed, entry.recording) for entry in found.episodes] == [(0, 0), (1, 2)]
+    assert [(entry.seed, recording_of(entry)) for entry in found.episodes] == [(0, 0), (1, 2)]
     for name, values in found.read(found.episodes[1]).items():
         np.testing.assert_array_equal(values, whole.read(whole.episodes[2])[name])
 

@@ -96,8 +96,8 @@ def test_fingers_may_come_in_messages_of_their_own_with_further_joints() -> None
     with pytest.raises(ValueError, match=r"joint state lacks left, right, .* it has two, one"):
         states.read(arm, 0.0)
     assert states.read(fingers, 1.0) is None
-    position, _, opening = states.read(arm, 1.4) or pytest.fail("it has the arm")
-    assert position.tolist() == [1.0, 2.0] and opening == pytest.approx(0.03)
+    found = states.read(arm, 1.4) or pytest.fail("it has the arm")
+    assert found.joints.tolist() == [1.0, 2.0] and found.opening == pytest.approx(0.03)
     with pytest.raises(ValueError, match="lacks left, right"):
         states.read(arm, 1.6)  # the fingers are silent
     assert states.read(joints(), 2.0) is not None
@@ -106,12 +106,13 @@ def test_fingers_may_come_in_messages_of_their_own_with_further_joints() -> None
 def test_joints_are_found_by_name() -> None:
     """Without a velocity they are at rest, and further joints do not matter."""
     states = messages.JointStates(ROBOT)
-    position, velocity, opening = states.read(joints(), 0.0) or pytest.fail("it has the arm")
-    assert (position.tolist(), velocity.tolist(), opening) == ([1.0, 2.0], [0.1, 0.2], pytest.approx(0.04))
+    found = states.read(joints(), 7.0) or pytest.fail("it has the arm")
+    assert (found.at, found.opening) == (7.0, pytest.approx(0.04))
+    assert (found.joints.tolist(), found.velocities.tolist()) == ([1.0, 2.0], [0.1, 0.2])
     for unknown in ([], [float("nan")] * 5):
-        assert states.read(joints(velocity=unknown), 0.0)[1].tolist() == [0.0, 0.0]  # type: ignore[index]
+        assert states.read(joints(velocity=unknown), 0.0).velocities.tolist() == [0.0, 0.0]  # type: ignore[union-attr]
     others = joints(name=["one", "two", "left", "right", "wheel"], position=[1.0, 2.0, 0.01, 0.02, float("nan")])
-    assert states.read(others, 0.0)[0].tolist() == [1.0, 2.0]  # type: ignore[index]
+    assert states.read(others, 0.0).joints.tolist() == [1.0, 2.0]  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def test_observations_are_those_of_the_messages_and_move_the_arm_from_its_measur
 
 
 def test_a_bug_in_a_callback_stops_the_arm_and_not_the_process(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(world.agent.loop, "on_image", lambda *_: 1 / 0)
+    monkeypatch.setattr(world.loop.observer, "add_image", lambda *_: 1 / 0)
     assert world.becomes(State.FAULT)
     world.live(0.4)
     assert world.commands[-1].position == world.commands[-5].position

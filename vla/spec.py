@@ -24,6 +24,7 @@ Array = np.ndarray
 IN_DISTRIBUTION = "seen"  # name of the unchanged condition of an evaluation, which a policy is trained for
 FIRST_SEED = 1_000_000  # smallest seed of evaluations; collection uses smaller seeds only
 LONGEST_INSTRUCTION = 1000  # characters
+MAX_SAMPLE = 2**18  # largest number of actions in a sample
 
 
 # Limits of a spec that is read from a file.
@@ -248,6 +249,34 @@ class Observation:
             raise UserError(f"the observation has {', '.join(map(str, values))}, but lacks {', '.join(missing_keys)}")
         rgb = {camera: values[camera] for camera in cameras}
         return cls(rgb, values["state"], values["instruction"])
+
+
+@dataclass(frozen=True)
+class ActionStatistics:
+    """Bounds and a sample of the actions of all steps of several episodes, on which tokenizers are fitted."""
+
+    actions: Array  # (N, D) float32, memory-mapped
+    ends: Array  # (E,) the row after the last of every episode
+
+    @property
+    def low(self) -> Array:
+        """(D,) smallest values."""
+        return self.actions.min(0)
+
+    @property
+    def high(self) -> Array:
+        """(D,) largest values."""
+        return self.actions.max(0)
+
+    def chunks(self, length: int) -> Array:
+        """Return chunks of actions, (M, length, D) float32, that start at evenly spaced steps, or at every step if few.
+
+        Beyond the end of an episode its last action is repeated, as in training windows.
+        """
+        count = min(len(self.actions), max(MAX_SAMPLE // length, 1))
+        rows = np.linspace(0, len(self.actions) - 1, count).round().astype(np.int64)
+        last_rows = self.ends[self.ends.searchsorted(rows, side="right")] - 1
+        return self.actions[np.minimum(rows[:, None] + np.arange(length), last_rows[:, None])]
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from lightning import LightningDataModule
 from torch import Tensor
 
 from vla.data.episodes import EpisodeStore
-from vla.data.index import Entry
+from vla.data.index import Entry, recording_of
 from vla.data.window_batches import Batch, WindowBatcher, joined
 from vla.io.errors import UserError, counted
 from vla.io.types import Count, Natural, Rate, Seed
@@ -35,7 +35,7 @@ GOLDEN_RATIO = 2654435769
 
 
 def held_out(recording: int, fraction: float) -> bool:
-    """Return whether an episode is held out for validation, independently of others, by its `Entry.recording`."""
+    """Return whether an episode is held out for validation, independently of others, by its `recording_of`."""
     return recording * GOLDEN_RATIO % 2**32 < fraction * 2**32
 
 
@@ -139,15 +139,16 @@ class WindowDataModule(LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         """Open the stores and split their episodes; a UserError if they do not match the spec, or are too few."""
         stores = [EpisodeStore(self._folder, self._episodes), *map(EpisodeStore, self._further_folders)]
-        counts = [max((entry.end for entry in store.episodes), default=0) for store in stores]
+        counts = [store.episodes[-1].end if store.episodes else 0 for store in stores]
+        self._starts = np.cumsum([0, *counts[:-1]])
         training, holdout = list[Array](), list[Array]()
-        for store, offset in zip(stores, np.cumsum([0, *counts]), strict=False):
+        for store, offset in zip(stores, self._starts, strict=True):
             name = f"the episode store {store.folder}"
             self._spec.require_input(store.spec, "the model", name)
             if store.spec.truth:  # a further store may lack it, which becomes NaN
                 replace(store.spec, truth=self._spec.truth).require(store.spec, "the model", name)
             for entry in store.episodes:
-                windows = holdout if held_out(entry.recording, self._fraction) else training
+                windows = holdout if held_out(recording_of(entry), self._fraction) else training
                 windows.append(offset + np.arange(entry.start, entry.end))
         episodes = [entry for store in stores for entry in store.episodes]
         if not training or (self._fraction > 0 and not holdout):
@@ -159,17 +160,21 @@ class WindowDataModule(LightningDataModule):
         self.training_windows = np.concatenate(training)  # row numbers
         self.held_out_windows = np.concatenate([np.empty(0, np.int64), *holdout])
         layout = self._history, self._chunk, self._on_gpu(), self._spec
-        self._batchers, self._starts = [WindowBatcher(store, *layout) for store in stores], np.cumsum([0, *counts])[:-1]
+        self._batchers = [WindowBatcher(store, *layout) for store in stores]
 
     def make_batch(self, windows: Array) -> Batch:
         """Return the batch of `windows` (B,), row numbers counted over all stores; its windows are sorted by store.
 
-        Raises as `WindowBatcher` does.
+        Its tokenized instructions are in page-locked memory if a GPU is to read them. Raises as `WindowBatcher` does.
         """
         store = self._starts.searchsorted(windows, side="right") - 1
         numbers = np.unique(store).tolist()
         parts = [self._batchers[number](windows[store == number] - self._starts[number]) for number in numbers]
-        return parts[0] if len(parts) == 1 else joined(parts)
+        batch = parts[0] if len(parts) == 1 else joined(parts)
+        if self._tokenize is not None:
+            text = self._tokenize(batch["instruction"])
+            batch["text"] = text.pin_memory() if self._on_gpu() else text
+        return batch
 
     def verify(self) -> None:
         """Raise a UserError if images differ from their checksums; otherwise an episode is verified when first read."""
@@ -196,19 +201,17 @@ class WindowDataModule(LightningDataModule):
 
     def train_dataloader(self) -> Prefetcher:
         """Return endless batches, from the trainer's current step on."""
-        return Prefetcher(self._make_batch, self._training_plan, self.ahead)
+        return Prefetcher(self.make_batch, self._training_plan, self.ahead)
 
-    def val_dataloader(self) -> Prefetcher | list[Batch]:
-        """Return the validation batches, the same every time."""
-        if not len(self.held_out_windows):
-            return []
+    def val_dataloader(self) -> Prefetcher:
+        """Return the validation batches, the same every time; some episodes must be held out."""
         rank, processes = self._place()
         global_batch = self.batch_size * processes
         batches = max(1, min(self._validation_windows, len(self.held_out_windows)) // global_batch)
         # Whole batches: one shape for a compiled model, and the same number of steps in all processes.
         indices = np.linspace(0, len(self.held_out_windows) - 1, batches * global_batch).round().astype(np.int64)
         windows = self.held_out_windows[indices].reshape(batches, self.batch_size, processes)
-        return Prefetcher(self._make_batch, lambda: windows[:, :, rank], self.ahead, batches)
+        return Prefetcher(self.make_batch, lambda: windows[:, :, rank], self.ahead, batches)
 
     def order(self, step: int, rank: int = 0, processes: int = 1) -> Array:
         """Return the windows (B,) of training step `step` in process `rank`, as row numbers.
@@ -221,14 +224,6 @@ class WindowDataModule(LightningDataModule):
         numbers = range(shuffle[0], shuffle[-1] + 1)
         indices = [_permutation(count, self._seed, number)[place[shuffle == number]] for number in numbers]
         return self.training_windows[np.concatenate(indices)]
-
-    def _make_batch(self, windows: Array) -> Batch:
-        """Return the batch of windows with its tokenized instructions, in page-locked memory if a GPU is to read it."""
-        batch = self.make_batch(windows)
-        if self._tokenize is not None:
-            text = self._tokenize(batch["instruction"])
-            batch["text"] = text.pin_memory() if self._on_gpu() else text
-        return batch
 
     def _training_plan(self) -> Iterator[Array]:
         rank, processes = self._place()

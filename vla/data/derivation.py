@@ -6,8 +6,6 @@ Nothing is changed in place: a new store is written to a temporary folder and re
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +17,7 @@ from vla.data.header import Codec
 from vla.data.index import DAMAGED, LOST, Entry
 from vla.data.verification import entries_by_config, episode_of, without_rows
 from vla.io.errors import UserError
-from vla.io.files import locked
+from vla.io.files import atomic_path, locked, remove_drafts
 from vla.io.printable import track
 
 Copies = Sequence[tuple[EpisodeStore, Entry]]  # of one seed and config
@@ -42,23 +40,21 @@ def derive_store(
     if not any(entry.stored for seeds in selection.values() for copies in seeds.values() for _, entry in copies):
         condition = f" that fit inspect.where={dict(where)}" if where else ""
         raise UserError(f"{', '.join(str(store.folder) for store in stores)}: there are no episodes{condition}")
-    draft = folder.with_name(f".{folder.name}.draft")
     folder.parent.mkdir(parents=True, exist_ok=True)
     message = f"another process writes {folder}: wait for it, or choose another inspect.into"
     lock = locked(folder.with_name(f".{folder.name}.lock"), message)
-    shutil.rmtree(draft, ignore_errors=True)  # left by a process that was killed
     try:
         if folder.exists():
             raise UserError(f"{folder} exists already and is left alone: choose another inspect.into")
+        remove_drafts(folder)  # of a process that was killed
         codecs = {store.codec for store in stores}
         codec = Codec("lossless") if len(codecs) > 1 else codecs.pop()  # no further loss
-        target = EpisodeStore.create_or_open(draft, stores[0].spec, _config(selection, stores, where), codec)
-        with target.writing():
-            seeds = [(seed, copies) for part in selection.values() for seed, copies in sorted(part.items())]
-            damaged_seeds = [seed for seed, copies in track(seeds, "writing") if not _write(target, copies, repair)]
-        os.rename(draft, folder)
-    except BaseException as error:
-        shutil.rmtree(draft, ignore_errors=True)
+        with atomic_path(folder) as draft:
+            target = EpisodeStore.create_or_open(draft, stores[0].spec, _config(selection, stores, where), codec)
+            with target.writing():
+                seeds = [(seed, copies) for part in selection.values() for seed, copies in sorted(part.items())]
+                damaged_seeds = [seed for seed, copies in track(seeds, "writing") if not _write(target, copies, repair)]
+    except UserError as error:
         if isinstance(error.__cause__, OSError):  # its message is about a store that grows, and does not apply here
             reason = f"{folder} cannot be written ({error.__cause__.strerror}), nothing of it is kept"
             raise UserError(f"{reason}: make room there, or choose another inspect.into") from error

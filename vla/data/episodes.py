@@ -29,12 +29,10 @@ from filelock import FileLock, Timeout
 from vla.data.fields import Field, Rows, ScatteredRows
 from vla.data.header import RAW, Codec, fields_of, is_store, read_header, write_header
 from vla.data.index import INDEX, REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
-from vla.data.statistics import Statistics
 from vla.io.documents import canonical
 from vla.io.errors import UserError, counted
-from vla.io.files import require_file
 from vla.parallel.limits import memory
-from vla.spec import FIRST_SEED, Array, Episode, Observation, Spec
+from vla.spec import FIRST_SEED, ActionStatistics, Array, Episode, Observation, Spec
 
 IN_MEMORY = 0.25  # a store is expected to stay in memory if it takes at most this share of it
 
@@ -54,10 +52,10 @@ class EpisodeStore:
     store, or one that has another format, is damaged, or has too few episodes).
 
     Attributes:
-        header: content of `store.json`.
         spec: layout of a step.
         config: of the task and the expert of the episodes.
-        fields: field → shape and dtype of a row, see `fields_of`.
+        fields: field → its files, see `fields_of`.
+        row_size: size of a decoded row in all fields together [bytes].
         codec: of the images.
         tried: one entry per seed.
         episodes: entries of the stored episodes, successes and labelled failures; at most `episodes`.
@@ -70,11 +68,11 @@ class EpisodeStore:
 
     def __init__(self, folder: str | Path, episodes: int | None = None, damaged: bool = False) -> None:
         self.folder = Path(folder)
-        self.header, self.spec = read_header(self.folder)
-        self.config: dict[str, Any] = self.header.config
-        self.fields = fields_of(self.spec)
-        self.codec: Codec = self.header.codec
-        self._columns = {name: Field(self.folder, name, *row, self.codec) for name, row in self.fields.items()}
+        header, self.spec = read_header(self.folder)
+        self.config: dict[str, Any] = header.config
+        self.codec: Codec = header.codec
+        self.fields = {name: Field(self.folder, name, *row, self.codec) for name, row in fields_of(self.spec).items()}
+        self.row_size = sum(column.size for column in self.fields.values())
         self._limit, self._damaged = episodes, damaged
         self._index, self._files = self.folder / INDEX, dict[Path, BinaryIO]()
         self._refresh()
@@ -147,11 +145,10 @@ class EpisodeStore:
         return self.tried[-1].seed + 1 if self.tried and not self.derived else None
 
     @property
-    def statistics(self) -> Statistics:
-        """Bounds and a sample of the actions in `episodes`; a UserError if there are none, or if they are damaged."""
-        self.require_episodes()
+    def statistics(self) -> ActionStatistics:
+        """Bounds and a sample of the actions in `episodes`, at least one; a UserError if they are damaged."""
         self.verify(self.episodes, {"action": self.rows("action")})
-        return Statistics(self.numbers("action"), np.array([entry.end for entry in self.episodes]))
+        return ActionStatistics(self.numbers("action"), np.array([entry.end for entry in self.episodes]))
 
     def numbers(self, field: str) -> Array:
         """Return the rows of a numeric field in `episodes`, (N, …), without those of further episodes in the store."""
@@ -163,13 +160,11 @@ class EpisodeStore:
         Compressed images, and rows of a large store that will be read in random order (`scattered`), are
         `ScatteredRows`, which raise a DamageError for a damaged image. All other rows are a memory-mapped array.
         """
-        if field not in self.fields:
-            raise UserError(f"{self.folder} has no field {field!r}: it has {sorted(self.fields)}")
-        shape, dtype = self.fields[field]
+        column = self.fields[field]
         if self._rows == 0:  # an empty file cannot be mapped
-            return np.empty((0, *shape), dtype)
-        large = self._rows * sum(column.size for column in self._columns.values()) > IN_MEMORY * memory()
-        return self._columns[field].rows(self._rows, partial(self._image_error, field), scattered and large)
+            return np.empty((0, *column.shape), column.dtype)
+        large = self._rows * self.row_size > IN_MEMORY * memory()
+        return column.rows(self._rows, partial(self._image_error, field), scattered and large)
 
     def packed(self, entry: Entry) -> dict[str, list[bytes]]:
         """Return the compressed images of an episode, by field; a DamageError if one is damaged."""
@@ -178,7 +173,7 @@ class EpisodeStore:
 
     def size(self, field: str, entry: Entry) -> int:
         """Return the size of a field of an episode on disk [bytes]."""
-        starts, ends = (self._columns[field].sizes(rows) for rows in (entry.start, entry.end))
+        starts, ends = (self.fields[field].sizes(rows) for rows in (entry.start, entry.end))
         return sum(ends) - sum(starts)
 
     def read(self, entry: Entry) -> dict[str, Array]:
@@ -186,7 +181,7 @@ class EpisodeStore:
 
         A UserError if it is larger than the memory: a few compressed bytes can promise any image.
         """
-        size = entry.steps * sum(column.size for column in self._columns.values())
+        size = entry.steps * self.row_size
         if self.codec != RAW and size > (limit := memory()):
             raise UserError(
                 f"seed {entry.seed} in {self.folder} unpacks to {size / 1e9:.0f} GB, and this machine has "
@@ -234,9 +229,8 @@ class EpisodeStore:
         with ExitStack() as stack:
             stack.callback(lock.release)
             self._refresh()
-            paths = (self._index, *(path for column in self._columns.values() for path in column.files))
+            paths = (self._index, *(path for column in self.fields.values() for path in column.files))
             for path in paths:  # an unpacked archive may contain links, whose targets would be overwritten
-                require_file(path)
                 if path.is_symlink():
                     raise UserError(f"{path} is a link, and a store never writes through one: replace it by a copy")
                 self._files[path] = stack.enter_context(path.open("ab", buffering=0))
@@ -260,7 +254,7 @@ class EpisodeStore:
                 f"seed {FIRST_SEED} one each"
             )
         rows = rows_of(self.spec, episode)
-        pieces = {name: self._columns[name].pieces(self._rows, rows[name], (packed or {}).get(name)) for name in rows}
+        pieces = {name: self.fields[name].pieces(self._rows, rows[name], (packed or {}).get(name)) for name in rows}
         # Checksums of JPEG are of the compressed bytes, because decoders differ in rounding.
         jpeg = [name for name in rows if self.codec.of(name) == "jpeg"]
         crc = {name: zlib.crc32(pieces[name][0] if name in jpeg else rows[name].data) for name in rows}
@@ -294,7 +288,7 @@ class EpisodeStore:
         entry = parse_line(line[:-1], f"{self.folder}: the entry of seed {entry.seed}")
         try:
             for name, contents in pieces.items():
-                for path, content in zip(self._columns[name].files, contents, strict=True):
+                for path, content in zip(self.fields[name].files, contents, strict=True):
                     _write(self._files[path], memoryview(content))
             _write(self._files[self._index], memoryview(line))
             self.tried.append(entry)
@@ -312,19 +306,19 @@ class EpisodeStore:
         """Truncate all files to what is committed."""
         # The index first: no line may refer to truncated rows at any moment.
         self._files[self._index].truncate(self._index_size)
-        for column in self._columns.values():
+        for column in self.fields.values():
             for path, size in zip(column.files, column.sizes(self._rows), strict=True):
                 self._files[path].truncate(size)
 
     def _refresh(self) -> None:
         """Read the index, which alone says what the store holds, whatever else the files of the fields contain."""
-        files = [column.files[0] for column in self._columns.values()]
+        files = [column.files[0] for column in self.fields.values()]
         if not self._index.exists() and (orphans := [path for path in files if path.exists()]):
             raise UserError(f"{self._index} is missing, which {orphans[0].name} beside it needs: {REMEDY}")
         self.tried, self._index_size = read_index(self._index, self.derived, self._damaged)
         self.episodes = [entry for entry in self.tried if entry.stored][: self._limit]
         self._rows = max((entry.end for entry in self.tried), default=0)
-        for column in self._columns.values():
+        for column in self.fields.values():
             complete_rows = column.whole(self._rows)
             if complete_rows < self._rows and not self._damaged:
                 raise UserError(f"{column.files[0]} is shorter than its index says: {SALVAGE}")

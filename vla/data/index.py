@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +15,7 @@ from annotated_types import Ge, Le, MaxLen, Predicate
 from vla.io.documents import STRICT, parse_json, read_bounded
 from vla.io.errors import UserError, counted
 from vla.io.types import Seed
-from vla.spec import LONGEST_INSTRUCTION, Name
+from vla.spec import LONGEST_INSTRUCTION, Episode, Name
 
 INDEX = "index.jsonl"  # in the folder of a store
 REMEDY = "copy the folder again from where it is whole, or delete it and collect again"
@@ -72,24 +72,19 @@ class Entry:
         return self.start + self.steps
 
     @property
-    def recording(self) -> int:
-        """Number of the recorded episode that it is a part of, see `recording_of`."""
-        return recording_of(self.seed, self.draws)
-
-    @property
     def span(self) -> slice:
         """The rows of the episode in every field file."""
         return slice(self.start, self.end)
 
 
-def recording_of(seed: int, draws: Mapping[str, Any]) -> int:
+def recording_of(episode: Entry | Episode) -> int:
     """Return the number of the recorded episode that an episode is, or is a part of; its seed if it was not recorded.
 
     Parts of one recording show the same scene: they are held out together, and count as one in statistics.
     """
-    recorded = draws.get("recorded")
+    recorded = episode.draws.get("recorded")
     number = recorded.get("episode") if isinstance(recorded, dict) else None
-    return number if isinstance(number, int) else seed
+    return number if isinstance(number, int) else episode.seed
 
 
 def index_line(entry: Entry) -> bytes:

@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 from action_msgs.msg import GoalStatus
+from rclpy.action import ActionClient
 
 from vla.deploy.lifecycle_node import GuardedLifecycleNode
 from vla.io.errors import UserError
@@ -23,7 +24,6 @@ class _SentGoal:
 
     at: float
     handle: Any = None  # once it is accepted
-    over: bool = False  # it has ended, or its result no longer matters
     cancelled: bool = False
 
     def cancel(self) -> None:
@@ -53,8 +53,9 @@ class GoalSender:
         """
         self.name = node.resolve_topic_name(name)
         self._node, self.kind, self._complaint, self._ended = node, kind, complaint, ended
-        self._client = node.add_action_client(kind, name)
-        self._goals: list[_SentGoal] = []  # that have not ended, the newest last
+        self._client = ActionClient(node, kind, name)
+        node.created.callback(self._client.destroy)
+        self._goals: list[_SentGoal] = []  # whose results still matter, the newest last
         self._failed = False
 
     def prepare(self) -> None:
@@ -65,8 +66,7 @@ class GoalSender:
                 f"there is no action server {self.name} of {kind}: is its controller active, and on the same network "
                 "and domain?"
             )
-        self._forget()
-        self._failed = False
+        self._goals, self._failed = [], False
 
     @property
     def active(self) -> bool:
@@ -96,36 +96,29 @@ class GoalSender:
         elif sending_times and time.monotonic() - sending_times[0] > ANSWER:
             self._give_up(f"has not answered a goal for {ANSWER:g} s")
 
-    def _forget(self) -> None:
-        for goal in self._goals:
-            goal.over = True
-        self._goals = []
-
     def _give_up(self, problem: str) -> None:
         for goal in self._goals:
             goal.cancel()
-        self._forget()
-        self._failed = True
+        self._goals, self._failed = [], True
         self._node.fail(f"the action server {self.name} {problem}")
 
     def _on_answer(self, goal: _SentGoal, future: Any) -> None:
-        handle = future.result()
+        handle, matters = future.result(), goal in self._goals
         if not handle.accepted:
-            if not goal.over:
+            if matters:
                 self._give_up("rejected a goal")
             return
         goal.handle = handle
-        if goal.over or goal.cancelled:  # in the meantime
+        if goal.cancelled or not matters:  # in the meantime
             handle.cancel_goal_async()
-        if not goal.over:
+        if matters:
             handle.get_result_async().add_done_callback(self._node.guard(partial(self._on_result, goal)))
 
     def _on_result(self, goal: _SentGoal, future: Any) -> None:
-        if goal.over:
+        if goal not in self._goals:
             return
         answer, is_newest = future.result(), goal is self._goals[-1]
         self._goals.remove(goal)
-        goal.over = True
         done = answer.status == GoalStatus.STATUS_SUCCEEDED or (is_newest and goal.cancelled)
         if not done and (complaint := self._complaint(answer.result, not is_newest)):
             verb = "cancelled" if answer.status == GoalStatus.STATUS_CANCELED else "aborted"

@@ -163,11 +163,11 @@ class _Bag:
 
     def _measure(self, at: float, message: Any) -> None:
         stamp = self._capture_time(at, message)
-        if (reading := self._joint_states.read(message, stamp)) is None:
+        if (joint_state := self._joint_states.read(message, stamp)) is None:
             raise UserError("they hold the fingers alone")
         stamp = max(stamp, self.measured[-1][0]) if self.measured else stamp
-        self.inputs.append((at, Measured(stamp, *reading)))
-        self.measured.append((stamp, np.append(reading[0], reading[2])))
+        self.inputs.append((at, joint_state._replace(at=stamp)))
+        self.measured.append((stamp, np.append(joint_state.joints, joint_state.opening)))
         assignment = _Assignment(self._number, self._instruction, bool(self._person))
         self._assignments.append(assignment if self._instruction and self._person is not None else None)
 

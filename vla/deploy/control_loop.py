@@ -36,7 +36,8 @@ class _Request:
 
 
 class ControlLoop:
-    """Turns images, joint states and instructions into joint commands within limits; not thread-safe."""
+    """Turns images and joint states, which its `observer` is given, and instructions into joint commands within limits;
+    not thread-safe."""
 
     def __init__(
         self,
@@ -73,7 +74,7 @@ class ControlLoop:
         self.late_plans, self.rejections, self.handed_over = 0, 0, False
         self.obstacle = ""  # external reason to hold the arm until this is empty again
         self.motion = Motion(self.limits, self.tick, 1 / self.spec.control_hz, self.goals.workspace)
-        self._observer, self._tracking = Observer(self.spec), Tracking(self.safety, self._follows_positions)
+        self.observer, self._tracking = Observer(self.spec), Tracking(self.safety, self._follows_positions)
         self._request: _Request | None = None
         self._planned = np.empty((0, len(self.spec.action)), np.float32)  # the actions in the schedule
         self.delays = Delays(1 / self.spec.control_hz)  # from observations to their plans
@@ -81,14 +82,6 @@ class ControlLoop:
         self.resumed = True  # True if the last observation is the first since the loop started to run
         self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
         self._timed_out = False  # True if the loop is stopped by a time-out
-
-    def on_image(self, camera: str, image: Array, at: float) -> None:
-        """Add an image (H, W, 3) uint8 that was taken at `at`."""
-        self._observer.add_image(camera, image, at)
-
-    def on_joint_state(self, joints: Array, velocities: Array, opening: float, at: float) -> None:
-        """Add measured joints (J,) [rad], their velocities [rad/s] and the gripper's opening [m], at `at`."""
-        self._observer.add_joint_state(Measured(at, joints, velocities, opening))
 
     def on_instruction(self, instruction: str, now: float) -> bool:
         """Set the instruction, which also ends a stop by time-out; an empty one stops the arm.
@@ -133,10 +126,10 @@ class ControlLoop:
     def take_back(self, now: float) -> None:
         """Command the arm again, from its measured pose; the gripper stays as it is until the policy moves it. Raises a
         UserError if the arm moves, is outside its limits, or has no recent joint state; the person then keeps it."""
-        joint_state = self._observer.newest
+        joint_state = self.observer.newest
         if (problem := self._joints_problem(now)) or joint_state is None:
             raise UserError(problem)
-        if self._observer.moved(STILL_FOR) > STILL:
+        if self.observer.moved(STILL_FOR) > STILL:
             raise UserError("the arm still moves: let it rest first")
         self.motion.start(joint_state.joints, None, now)
         self._tracking = Tracking(self.safety, self._follows_positions)
@@ -163,7 +156,7 @@ class ControlLoop:
     def next_observation(self, now: float) -> Observation | None:
         """Return the observation for the policy if an inference is due; then call `set_plan` or `reject_plan`."""
         schedule = self.motion.schedule
-        image_time = self._observer.due(
+        image_time = self.observer.due(
             self._last_observed, schedule.end if self._execute is None else schedule.executed(self._execute)
         )
         if self.state is not State.RUNNING or self._request is not None or image_time is None:
@@ -172,12 +165,11 @@ class ControlLoop:
             self.late_plans += 1
         # Anchor on the pose commanded at that time. The measured pose lags behind it; the last goal runs ahead of an
         # arm that its limits slow down, and the policy would overshoot.
-        anchor = self.motion.commanded_at(image_time)
-        if not self._follows_positions:
-            anchor = self._observer.measured_at(image_time).joints
+        measured = self.observer.measured_at(image_time)
+        anchor = self.motion.commanded_at(image_time) if self._follows_positions else measured.joints
         self.resumed, self._last_observed, self.observed_at = np.isinf(self._last_observed), image_time, image_time
         self._request = _Request(now, image_time, anchor)
-        observation = self._observer.observation(image_time, self.instruction)
+        observation = Observation(self.observer.images, self.observer.state(measured), self.instruction)
         steps_left = len(schedule.remaining(image_time + 0.5 / self.spec.control_hz))  # an image may be early
         if self._execute is None or not steps_left:
             return observation
@@ -201,7 +193,7 @@ class ControlLoop:
         if follows := self.state is State.RUNNING and not request.outdated:
             self.rejections, self._planned = 0, actions
             # An arm that does not follow its commands is where it is measured, not where it was commanded.
-            joint_state = None if self._follows_positions else self._observer.newest
+            joint_state = None if self._follows_positions else self.observer.newest
             self.motion.follow(waypoints, None if joint_state is None else joint_state.joints)
         return follows
 
@@ -232,7 +224,7 @@ class ControlLoop:
 
     def _supervise(self, now: float) -> None:
         """Change the state if an input is missing, late or invalid, or fresh again."""
-        joint_state = self._observer.newest
+        joint_state = self.observer.newest
         if joint_state is None:
             return
         if not self.motion.started and self.state is not State.FAULT:  # after which a person must inspect the arm
@@ -256,9 +248,9 @@ class ControlLoop:
             self._timed_out = True
         elif problem := self._input_problem(joint_state, now):
             # A held arm moves again only after consecutive fresh frames.
-            self._observer.fresh = 0
+            self.observer.fresh = 0
             self._set_state(State.HOLDING if self.state is State.RUNNING else self.state, problem)
-        elif self.state is State.WAITING or self._observer.fresh >= self.safety.fresh_frames:
+        elif self.state is State.WAITING or self.observer.fresh >= self.safety.fresh_frames:
             self._set_state(State.RUNNING, "")
 
     def _take_over(self, state: Measured, now: float) -> None:
@@ -271,12 +263,12 @@ class ControlLoop:
     @property
     def _must_stay(self) -> bool:
         """Whether the arm is to stay where it is; after a fault it may still be on its way to rest."""
-        resting = self.motion.limiter.resting and self._observer.moved(STILL_FOR) <= STILL
+        resting = self.motion.limiter.resting and self.observer.moved(STILL_FOR) <= STILL
         return self.state is State.STOPPED or (self.state is State.FAULT and resting)
 
     def _input_problem(self, joint_state: Measured, now: float) -> str:
         """Describe which input or inference is overdue; empty if none is."""
-        if problem := self.obstacle or self._observer.image_problem(now, self.safety.image_age):
+        if problem := self.obstacle or self.observer.image_problem(now, self.safety.image_age):
             return problem
         if problem := self._joints_problem(now):
             return problem
@@ -286,7 +278,7 @@ class ControlLoop:
 
     def _joints_problem(self, now: float) -> str:
         """Say that the newest joint state is too old, or that there is none; empty if it is recent."""
-        joint_state = self._observer.newest
+        joint_state = self.observer.newest
         is_recent = joint_state is not None and now - joint_state.at <= self.safety.joints_age
         return "" if is_recent else f"no joint state within the last {self.safety.joints_age} s"
 
@@ -294,7 +286,7 @@ class ControlLoop:
         if state is not self.state:
             self._drop_plans()
             if state is not State.RUNNING:  # when it runs again, the policy begins anew with the newest frame
-                self._observer.fresh, self._last_observed = 0, -np.inf
+                self.observer.fresh, self._last_observed = 0, -np.inf
         self.state, self.reason = state, reason
 
     def _drop_plans(self) -> None:

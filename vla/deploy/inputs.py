@@ -57,7 +57,7 @@ class Inputs:
         except UserError as error:
             return self._diagnostics.drop(f"camera {camera}: {error}")
         self._diagnostics.record("image age", age)
-        self._loop.on_image(camera, image, now - age)
+        self._loop.observer.add_image(camera, image, now - age)
         self._advance()
 
     def _age(self, source: str, message: Any) -> float:
@@ -84,11 +84,11 @@ class Inputs:
         try:
             has_arm = not {*message.name}.isdisjoint(self._loop.limits.joints)
             age = self._age("arm" if has_arm else "fingers", message)
-            reading = self._joint_states.read(message, now - age)
+            joint_state = self._joint_states.read(message, now - age)
         except UserError as error:
             return self._diagnostics.drop(f"joint states: {error}")
-        if reading is not None:
-            self._loop.on_joint_state(*reading, now - age)
+        if joint_state is not None:
+            self._loop.observer.add_joint_state(joint_state)
 
     def _on_instruction(self, message: String) -> None:
         if not self._node.active:

@@ -12,7 +12,6 @@ from contextlib import ExitStack
 from functools import wraps
 from typing import Any
 
-from rclpy.action import ActionClient
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
@@ -72,12 +71,6 @@ class GuardedLifecycleNode(LifecycleNode):
     def add_service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
         """Create a service."""
         self.created.callback(self.destroy_service, self.create_service(kind, name, callback))
-
-    def add_action_client(self, kind: Any, name: str) -> ActionClient:
-        """Create the client of an action."""
-        client = ActionClient(self, kind, name)
-        self.created.callback(client.destroy)
-        return client
 
     def guard(self, callback: Callable[..., None]) -> Callable[..., None]:
         """Wrap a callback: an exception stops the arm, not the process."""

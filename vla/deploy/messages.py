@@ -15,6 +15,7 @@ import numpy as np
 from annotated_types import MaxLen
 
 from vla.deploy.joint_limiter import JointLimits
+from vla.deploy.observer import Measured
 from vla.io.documents import STRICT, parse_json
 from vla.io.errors import UserError
 from vla.io.images import decode_image
@@ -94,8 +95,8 @@ class JointStates:
         """Args: the limits, of which names and positions are used."""
         self._limits, self._fingers = limits, (-np.inf, 0.0)  # when they came, opening
 
-    def read(self, message: Any, at: float) -> tuple[Array, Array, float] | None:
-        """Return positions (J,) [rad], velocities (J,) [rad/s] and gripper opening [m] in a sensor_msgs/JointState.
+    def read(self, message: Any, at: float) -> Measured | None:
+        """Return the joint state in a sensor_msgs/JointState.
 
         Joints are found by name. Missing velocities, also NaN, become zero. A message with only the fingers returns
         None, and provides the opening for later ones during `FINGERS_AGE`. Raises a UserError if a joint is missing,
@@ -120,7 +121,7 @@ class JointStates:
         if (violations := (place < low - BEYOND) | (place > high + BEYOND)).any():
             joint = int(np.argmax(violations))
             raise UserError(f"joint state has {arm[joint]} at {place[joint]:g} rad, where this arm cannot be")
-        return place, velocity[: len(arm)], opening
+        return Measured(at, place, velocity[: len(arm)], opening)
 
 
 def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:

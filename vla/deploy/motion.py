@@ -172,24 +172,6 @@ class Motion:
         self._record(now)
         return _command(self.limiter, self._opening)
 
-    def horizon(self, now: float, longest: float) -> list[Command]:
-        """Return the commands after this tick's if no further input arrives; the last one is at rest.
-
-        Args:
-            now: the time of this tick [s].
-            longest: time [s] after which the arm brakes, if the schedule has not ended before.
-        """
-        limiter, opening = copy.copy(self.limiter), self._opening
-        commands, end = [], min(now + longest, self.schedule.end)
-        while now < end:
-            now += self.tick
-            opening = self._step(limiter, now, opening)
-            commands.append(_command(limiter, opening))
-        while not limiter.resting or not commands:
-            limiter.brake()
-            commands.append(_command(limiter, opening))
-        return commands
-
     def commit(self, command: Command, now: float) -> list[Command] | None:
         """Return the trajectory from this command to rest, for an arm that executes it by itself.
 
@@ -204,9 +186,22 @@ class Motion:
     def ahead(self, command: Command, now: float, longest: float = math.inf) -> list[Command]:
         """Return the trajectory from this command to rest, which the arm follows until it is sent another one.
 
-        The next command continues from where the arm is on it by then, even if that tick is late. Args: as `horizon`.
+        The next command continues from where the arm is on it by then, even if that tick is late.
+
+        Args:
+            command: of this tick.
+            now: the time of this tick [s].
+            longest: time [s] after which the arm brakes, if the schedule has not ended before.
         """
-        trajectory = [command, *self.horizon(now, longest)]
+        limiter, opening = copy.copy(self.limiter), self._opening
+        trajectory, time, end = [command], now, min(now + longest, self.schedule.end)
+        while time < end:
+            time += self.tick
+            opening = self._step(limiter, time, opening)
+            trajectory.append(_command(limiter, opening))
+        while not limiter.resting or len(trajectory) == 1:
+            limiter.brake()
+            trajectory.append(_command(limiter, opening))
         self._sent_trajectory = now, [self._last_command, *trajectory]
         return trajectory
 

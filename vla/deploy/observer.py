@@ -12,7 +12,7 @@ import numpy as np
 
 from vla.io.errors import UserError
 from vla.robots.controllers import UNITS
-from vla.spec import Array, Observation, Spec
+from vla.spec import Array, Spec
 
 EARLY_SHARE = 0.25  # share of a control period by which an image may precede the next planned observation
 HISTORY = 1.0  # duration of the history of joint states [s]
@@ -109,10 +109,6 @@ class Observer:
     def measured_at(self, at: float) -> Measured:
         """Return the joint state nearest to `at` in the history."""
         return min(self._joint_states, key=lambda state: abs(state.at - at))
-
-    def observation(self, at: float, instruction: str) -> Observation:
-        """Return the newest images, taken at `at`, with the joint state of that time."""
-        return Observation(self.images, self.state(self.measured_at(at)), instruction)
 
     def state(self, measured: Measured) -> Array:
         """Return the robot state (P,) float32 in the order and units of the spec."""

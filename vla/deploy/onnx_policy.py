@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import json
 import logging
 from collections.abc import Callable
 from itertools import chain
@@ -23,7 +22,7 @@ from torch.export import Dim, ExportedProgram
 
 from vla.io.documents import lines_of
 from vla.io.errors import UserError
-from vla.io.files import atomic_path
+from vla.io.files import atomic_path, write_json
 from vla.io.types import Text
 from vla.models.model import Batch, Model, Prediction
 from vla.policy import Policy
@@ -110,7 +109,7 @@ def write_programs(policy: Policy, folder: Path) -> None:
                 for name, value in steps[0].items()
             }
             report[part] = {"inputs": inputs, "difference": difference}
-        (draft / "program.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        write_json(draft / "program.json", report)
 
 
 def example_inputs(policy: Policy) -> dict[Literal["encode", "act"], list[Inputs]]:

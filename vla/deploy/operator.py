@@ -140,18 +140,7 @@ class DemoOperator(Operator):
         self.wait(lambda: self._words.get_subscription_count() >= 2, "both nodes to subscribe", START)
 
     def play(self) -> Result | None:
-        """Play one episode; return None if it was interrupted."""
-        self.begin_episode()
-        self.wait(lambda: not self._playing or self.stopped.is_set(), "the end of an episode", math.inf)
-        episode = self._episode
-        assert episode is not None
-        if not episode.done:
-            return None
-        details = {"task": episode.task, "milestones": episode.milestones, "motion": Motion(round(episode.seconds, 1))}
-        return Result(episode.seed, episode.outcome, episode.instruction, episode.steps, **details)
-
-    def begin_episode(self) -> None:
-        """Begin an episode, after the last has ended, and send its instruction."""
+        """Play one episode, after the last has ended; return None if it was interrupted."""
         is_over = self._episode is not None and self._episode.done
         if is_over:
             self._episode = None
@@ -159,6 +148,13 @@ class DemoOperator(Operator):
         self.wait(lambda: self._playing, "an episode")
         assert self._episode is not None
         self._words.publish(String(data=self._episode.instruction))
+        self.wait(lambda: not self._playing or self.stopped.is_set(), "the end of an episode", math.inf)
+        episode = self._episode
+        assert episode is not None
+        if not episode.done:
+            return None
+        details = {"task": episode.task, "milestones": episode.milestones, "motion": Motion(round(episode.seconds, 1))}
+        return Result(episode.seed, episode.outcome, episode.instruction, episode.steps, **details)
 
     @property
     def _playing(self) -> bool:

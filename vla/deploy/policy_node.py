@@ -55,7 +55,8 @@ class PolicyNode(GuardedLifecycleNode):
             raise UserError(
                 "deploy/gripper needs a policy that moves a gripper, and its action server in deploy.topics.gripper"
             )
-        if loop.goals.has_gripper and not settings.moves_gripper:
+        has_positions = settings.robot.fingers and (settings.command == "joint_state" or topics.gripper)
+        if loop.goals.has_gripper and not (settings.gripper or has_positions):
             self.get_logger().warning(
                 "the policy moves a gripper, and nothing commands it: set deploy.topics.gripper, with "
                 "deploy.robot.fingers or deploy/gripper"

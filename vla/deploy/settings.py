@@ -150,12 +150,6 @@ class PolicySettings(NodeSettings):
     safety: Safety
     autostart: bool
 
-    @property
-    def moves_gripper(self) -> bool:
-        """Whether the gripper commands of a policy are sent to a topic or an action server."""
-        positions = self.robot.fingers and (self.command == "joint_state" or self.topics.gripper)
-        return bool(self.gripper or positions)
-
 
 @dataclass(kw_only=True)
 class SimulatorSettings(NodeSettings):

@@ -15,7 +15,7 @@ from vla.config.experiment import Experiment
 from vla.data.datamodule import digest_of, held_out
 from vla.data.episodes import EpisodeStore
 from vla.data.header import is_store
-from vla.data.index import Entry
+from vla.data.index import Entry, recording_of
 from vla.data.verification import episode_of
 from vla.io.errors import UserError
 from vla.io.files import warn_on_error, writing
@@ -115,7 +115,7 @@ def _measure(experiment: Experiment, store: EpisodeStore, fraction: float, polic
     """Return the errors on the held-out episodes; raise a UserError if there are none, or no others."""
     parts: dict[bool, list[Entry]] = {True: [], False: []}
     for entry in store.episodes:
-        parts[held_out(entry.recording, fraction)].append(entry)
+        parts[held_out(recording_of(entry), fraction)].append(entry)
     if not all(parts.values()):
         raise UserError(
             f"data.validation_fraction={fraction} holds {len(parts[True])} of the {len(store.episodes)} episodes in "

@@ -45,7 +45,7 @@ def store_table(findings: StoreReport) -> Table:
     for name, counts in (("outcomes", findings.outcomes), ("instructions", instructions)):
         rows[name] = "\n".join(f"{count} {words}" for words, count in counts.items())
     for name, size in findings.sizes.items():
-        shape, dtype = store.fields[name]
+        shape, dtype = store.fields[name].shape, store.fields[name].dtype
         rows[name] = f"{size / 1e6:.1f} MB, {dtype.name} {' x '.join(map(str, shape))} per step"
     rows["all fields"] = f"{sum(findings.sizes.values()) / 1e6:.1f} MB"
     rows["cameras"] = f"{', '.join(spec.cameras)}: {spec.image_size[0]} x {spec.image_size[1]} px"

@@ -60,7 +60,7 @@ def open_loop(agent: Agent, spec: Spec, episodes: Iterable[Episode], constant: A
             raise UserError(f"the agent's actions must be {len(spec.action)} finite numbers, as in the spec")
         recorded.append(episode.actions)
         seeds.append(episode.seed)
-        recordings.append(recording_of(episode.seed, episode.draws))
+        recordings.append(recording_of(episode))
 
     def by_recording(errors: Array) -> Array:
         """Return the (R, D) means of (E, D) errors over the episodes of every recording."""

@@ -6,8 +6,8 @@ import numpy as np
 from torch import Tensor
 
 from vla.io.types import Bins
-from vla.models.tokenizers.tokenizer import ActionStatistics, EvenBins
-from vla.spec import Spec
+from vla.models.tokenizers.tokenizer import EvenBins
+from vla.spec import ActionStatistics, Spec
 
 
 class Few(EvenBins):

@@ -91,12 +91,9 @@ class ImportedDemonstrations(ABC):
     def fill(self, store: EpisodeStore, episodes: int) -> int:
         """Append episodes until the store holds `episodes`; returns the number appended (UserError: there are too few,
         the store holds other ones, one is damaged, or the disk is full)."""
-        self.require_enough(episodes)
         if episodes < len(self):
             log.info("collect.episodes=%d of the %d recorded episodes are used", episodes, len(self))
         self.require_held(store)
-        if len(store.episodes) >= episodes:
-            return 0
         store.require_growable()
         with store.writing():  # another process may have added some meanwhile
             next_seed = store.next_seed or 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import cycle
-from math import prod
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -57,8 +56,7 @@ def _measure_large_images(experiment: Experiment, chunk: int) -> dict[str, Measu
             name, steps = f"loader: 3 x {LARGE} px, {codec.images}", store.episodes[-1].end
             measures[name] = _measure_loading(variant, store, 1, chunk)
             size = sum(store.size(field, entry) for field in store.fields for entry in store.episodes) / steps
-            raw = sum(prod(shape) * dtype.itemsize for shape, dtype in store.fields.values())
-            total = measure(EPISODES * STEPS * size / 1e9, "GB", steps, EPISODES * STEPS * raw / 1e9)
+            total = measure(EPISODES * STEPS * size / 1e9, "GB", steps, EPISODES * STEPS * store.row_size / 1e9)
             measures[f"{name}, {EPISODES} x {STEPS} steps"] = total
     return measures
 

@@ -17,8 +17,8 @@ from torch import Tensor
 from vla.io.errors import UserError
 from vla.io.types import Bins, Positive, Steps
 from vla.models.layers import exact_product
-from vla.models.tokenizers.tokenizer import MIN_SPAN, ActionStatistics, ActionTokenizer, data_bounds
-from vla.spec import Spec
+from vla.models.tokenizers.tokenizer import MIN_SPAN, ActionTokenizer, data_bounds
+from vla.spec import ActionStatistics, Spec
 
 FIRST_CODE_POINT = 0x100  # of the smallest coefficient
 MOST_VALUES = 0xD800 - FIRST_CODE_POINT  # of coefficients; below 0xD800 every code point is a character

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from vla.io.types import Bins
-from vla.models.tokenizers.tokenizer import ActionStatistics, PerComponent, data_bounds
-from vla.spec import Spec
+from vla.models.tokenizers.tokenizer import PerComponent, data_bounds
+from vla.spec import ActionStatistics, Spec
 
 
 class Quantile(PerComponent):

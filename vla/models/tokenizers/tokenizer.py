@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -16,28 +15,13 @@ from torch import Tensor, nn
 
 from vla.io.errors import UserError
 from vla.io.types import Bins, Natural, NonNegative
-from vla.spec import Spec
+from vla.spec import ActionStatistics, Spec
 
 # Fixed bounds of RT-1: 1 m, a right angle, and a gripper command of one (arXiv 2212.06817).
 RT1_BOUNDS = {"m": 1.0, "rad": math.pi / 2, "1": 1.0}
 
 # Smallest range of the bins of a component, as a fraction of its allowed range.
 MIN_SPAN = 0.05
-
-
-class ActionStatistics(Protocol):
-    """Statistics of a dataset that tokenizers are fitted on: bounds of its actions and a sample of its chunks."""
-
-    @property
-    def low(self) -> np.ndarray:
-        """Return the smallest action, (D,)."""
-
-    @property
-    def high(self) -> np.ndarray:
-        """Return the largest action, (D,)."""
-
-    def chunks(self, length: int) -> np.ndarray:
-        """Return (N, length, D) float32 chunks of consecutive actions."""
 
 
 class ActionTokenizer(nn.Module, ABC):
