@@ -148,7 +148,7 @@ def test_validation_is_the_same_pass_in_whole_batches(folder: Path) -> None:
     assert len(first) == len(second) == 5
     assert all(torch.equal(one["rgb"]["eye"], two["rgb"]["eye"]) for one, two in zip(first, second, strict=True))
     assert all(len(batch["action"]) == 8 for batch in first)
-    assert not len(windows(folder, validation_fraction=0.0).held_out_windows)
+    assert windows(folder, validation_fraction=0.0).val_dataloader() == []
 
 
 def test_the_stream_is_made_ahead_but_not_without_bound(folder: Path) -> None:

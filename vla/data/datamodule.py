@@ -203,8 +203,10 @@ class WindowDataModule(LightningDataModule):
         """Return endless batches, from the trainer's current step on."""
         return Prefetcher(self.make_batch, self._training_plan, self.ahead)
 
-    def val_dataloader(self) -> Prefetcher:
-        """Return the validation batches, the same every time; some episodes must be held out."""
+    def val_dataloader(self) -> Prefetcher | list[Batch]:
+        """Return the validation batches, the same every time."""
+        if not len(self.held_out_windows):
+            return []
         rank, processes = self._place()
         global_batch = self.batch_size * processes
         batches = max(1, min(self._validation_windows, len(self.held_out_windows)) // global_batch)

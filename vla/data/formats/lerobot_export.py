@@ -59,7 +59,8 @@ class LeRobotExporter:
 
     def export(self, store: EpisodeStore, cluster: Cluster = THIS_PROCESS) -> Path:
         """Write the dataset, or resume an interrupted export; returns the folder (UserError: the folder has other
-        content, or the store is damaged)."""
+        content, or the store is damaged or empty)."""
+        store.require_episodes()
         episodes = [provenance(entry) for entry in store.episodes]
         source = {"spec": store.spec.to_dict(), "crf": self._crf, "episodes": episodes}
         with staging_folder(self._folder) as staging:

@@ -182,6 +182,10 @@ class CompiledScene:
         controls[:, self._grips] = robot.closed + commands[:, -1:] * ((robot.opened - robot.closed) / robot.travel)
         return controls
 
+    def turn_camera(self, camera: int, rotation: Array) -> None:
+        """Turn camera `camera` by the rotation vector `rotation` (3,) [rad] in its own frame."""
+        mujoco.mju_quatIntegrate(self.model.cam_quat[camera], rotation, 1.0)
+
     def place_block(self, index: int, x: float, y: float, yaw: float) -> None:
         """Put block `index` on the table at (x, y) [m], turned by `yaw` [rad]."""
         start = self.block_positions[index]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
-import mujoco
 import numpy as np
 from annotated_types import Ge, Le
 
@@ -56,7 +55,7 @@ class Cameras:
             zoom = random_state.uniform(-share, share)
             scene.model.cam_pos[camera] += self.position * shift
             scene.model.cam_fovy[camera] += self.fovy * zoom
-            mujoco.mju_quatIntegrate(scene.model.cam_quat[camera], self.rotation * turn, 1.0)  # in its own frame
+            scene.turn_camera(camera, self.rotation * turn)
             draws[name] = {
                 "position": rounded(self.position * shift),
                 "rotation": rounded(self.rotation * turn),
