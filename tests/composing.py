@@ -15,8 +15,8 @@ from vla.config import check as checking
 from vla.config.annotations import packages as packages_in
 from vla.config.compose import CONF as CONF
 from vla.config.compose import compose, offer_axes
-from vla.config.experiment import Experiment, plain
-from vla.config.packages import TRUSTED, trusted
+from vla.config.experiment import Experiment, to_plain
+from vla.config.packages import TRUSTED, trusted_names
 
 offer_axes()
 
@@ -35,9 +35,9 @@ def composed(*overrides: str) -> DictConfig:
 
 def check(config: DictConfig) -> None:
     """Check a configuration as the command line does, for its job, with trust in the packages that it uses."""
-    nodes = plain(config)
+    nodes = to_plain(config)
     used = packages_in(nodes)
-    with patch.dict(os.environ, {TRUSTED: ",".join([*trusted(), *used])}):
+    with patch.dict(os.environ, {TRUSTED: ",".join([*trusted_names(), *used])}):
         checking.check(Experiment(nodes), jobs.find(config.job))
 
 
@@ -55,4 +55,4 @@ def _composed_once(overrides: tuple[str, ...]) -> DictConfig:
 def run_job(config: DictConfig) -> None:
     """Check and run a job as the command line does."""
     check(config)
-    jobs.run(Experiment.of(config))
+    jobs.run(Experiment.from_config(config))

@@ -10,7 +10,7 @@ from toy import ARM_SPEC, ToyEnvironment, ToyExpert
 from toy_episodes import add
 
 from vla.config.build import build
-from vla.config.experiment import plain
+from vla.config.experiment import to_plain
 from vla.data.episodes import EpisodeStore
 from vla.rollouts.rollout import rollout
 from vla.spec import Episode, Spec
@@ -24,7 +24,7 @@ def stored(folder: Path, spec: Spec = ARM_SPEC, seeds: range = range(2)) -> tupl
 
 def composed(name: str, folder: Path, *overrides: str) -> Any:
     """The configuration of `export=name` and `overrides`."""
-    return plain(composing.composed(f"export={name}", f"export.folder={folder}", *overrides).export)
+    return to_plain(composing.composed(f"export={name}", f"export.folder={folder}", *overrides).export)
 
 
 def exporter(name: str, folder: Path, *overrides: str) -> Any:

@@ -15,7 +15,7 @@ from toy import SPEC
 
 from vla.config.adopt import adopt, finetune
 from vla.config.build import build
-from vla.config.experiment import make_policy, plain
+from vla.config.experiment import make_policy, to_plain
 
 HANDLER = "torch.distributed.elastic.multiprocessing.subprocess_handler.subprocess_handler.SubprocessHandler"
 
@@ -75,7 +75,11 @@ def python(mark: Path) -> dict[str, Any]:
 
 def remote(port: int, key: str | None = None) -> dict[str, Any]:
     """An agent that connects with this port."""
-    return plain(composed("agent=remote"))["agent"] | {"url": f"ws://127.0.0.1:{port}", "api_key": key, "timeout": 1.0}
+    return to_plain(composed("agent=remote"))["agent"] | {
+        "url": f"ws://127.0.0.1:{port}",
+        "api_key": key,
+        "timeout": 1.0,
+    }
 
 
 def recorded() -> dict[str, Any]:
@@ -130,7 +134,7 @@ def ways(policy: Path, *own: str) -> dict[str, Callable[[], object]]:
         return lambda: run_job(finetune(composed(*own, f"pretrained={policy}", f"job={job}"), []))
 
     return {
-        "policy": lambda: make_policy(plain(composed().policy), policy),  # as programs do
+        "policy": lambda: make_policy(to_plain(composed().policy), policy),  # as programs do
         **{"evaluate": adopted(), "deploy": adopted("job=deploy", "deploy=ros2")},
         **{"pretrained": tuned("train"), "improve": tuned("improve")},
     }

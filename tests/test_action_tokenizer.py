@@ -21,7 +21,14 @@ from vla.models.layers import mean_where
 from vla.models.policy_folder import read_policy
 from vla.models.tokenizers.fast import Fast
 from vla.models.tokenizers.quantile import Quantile
-from vla.models.tokenizers.tokenizer import ActionTokenizer, PerComponent, RT1Bins, Uniform, out_of_bounds, rounding
+from vla.models.tokenizers.tokenizer import (
+    ActionTokenizer,
+    ComponentTokenizer,
+    RT1Bins,
+    Uniform,
+    out_of_bounds,
+    rounding,
+)
 from vla.spec import ActionStatistics
 
 
@@ -33,7 +40,7 @@ def between(low: list[float], high: list[float]) -> ActionStatistics:
 BOUNDS = between([-0.02, -0.01, 0.0], [0.03, 0.04, 1.0])
 
 
-def tokenizers() -> list[PerComponent]:
+def tokenizers() -> list[ComponentTokenizer]:
     return [
         Uniform(spec=SPEC, statistics=BOUNDS, **defaults_of("tokenizer/uniform")),
         RT1Bins(spec=SPEC, **defaults_of("tokenizer/rt1")),
@@ -41,7 +48,7 @@ def tokenizers() -> list[PerComponent]:
 
 
 @pytest.mark.parametrize("tokenizer", tokenizers(), ids=["uniform", "rt1"])
-def test_every_token_survives_the_round_trip_and_the_outermost_are_those_beyond(tokenizer: PerComponent) -> None:
+def test_every_token_survives_the_round_trip_and_the_outermost_are_those_beyond(tokenizer: ComponentTokenizer) -> None:
     tokens = torch.arange(256)[:, None].expand(256, 3)
     assert torch.equal(tokenizer.encode(tokenizer.decode(tokens)), tokens)
     for far, token in ((-9.0, 0), (9.0, 255)):
@@ -92,7 +99,7 @@ def test_what_does_not_fit_the_actions_is_refused() -> None:
     [*tokenizers(), Uniform(spec=SPEC, **defaults_of("tokenizer/uniform", smoothing=0))],
     ids=["uniform", "rt1", "hard"],
 )
-def test_minimising_the_loss_makes_the_action_the_one_that_is_read(tokenizer: PerComponent) -> None:
+def test_minimising_the_loss_makes_the_action_the_one_that_is_read(tokenizer: ComponentTokenizer) -> None:
     action = torch.tensor([[0.0123, -0.0042, 0.9]])
     logits = torch.zeros(1, 3, 256, requires_grad=True)
     optimizer = torch.optim.Adam([logits], lr=0.3)
@@ -203,9 +210,9 @@ def test_what_lies_beyond_the_bounds_is_counted() -> None:
 def test_tokens_are_drawn_from_the_targets() -> None:
     soft, hard = Uniform(spec=SPEC, statistics=MOTIONS, **defaults_of("tokenizer/uniform")), EVERY["quantile"]
     tokens = soft.tokenize(CHUNKS)
-    off = (soft.sampled(tokens, CHUNKS) - tokens)[:, :2].double()
+    off = (soft.sample_inputs(tokens, CHUNKS) - tokens)[:, :2].double()
     assert off.std().item() == pytest.approx(3.0, rel=0.1) and abs(off.mean().item()) < 0.2
-    assert torch.equal(hard.sampled(tokens, CHUNKS), tokens)
+    assert torch.equal(hard.sample_inputs(tokens, CHUNKS), tokens)
 
 
 def test_quantile_bins_hold_as_many_actions_each_and_are_read_as_their_mean() -> None:

@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState
 from world import TOPICS, World
 
 from vla.deploy import actions
-from vla.deploy.bag import opened
+from vla.deploy.bag import open_bag
 from vla.deploy.bag_import import BagDemonstrations
 from vla.deploy.record import BagRecorder
 from vla.deploy.ros import RosNetwork
@@ -370,7 +370,7 @@ def test_a_topic_of_an_unknown_type_does_not_end_a_recording(
     topics = [(topic, [kind]) for topic, kind in kinds.items()]
     monkeypatch.setattr(node, "get_topic_names_and_types", lambda: topics)
     BagRecorder(node, tmp_path / "bag").close()
-    with opened(tmp_path / "bag") as reader:
+    with open_bag(tmp_path / "bag") as reader:
         assert [connection.topic for connection in reader.connections] == ["/words"]
 
 

@@ -10,7 +10,7 @@ from command_line import SMALL, here, vla
 from composing import check, composed
 
 from vla.config.build import build
-from vla.config.experiment import plain
+from vla.config.experiment import to_plain
 from vla.tasks.gl import WORKING_BACKEND
 
 # Line → what its sentence says.
@@ -128,7 +128,7 @@ def test_a_phrasing_that_is_no_phrasing_is_refused(phrasing: str) -> None:
     cfg = composed()
     cfg.task.goal.language.phrasings = [phrasing]
     with pytest.raises(ValueError, match=r"^task\.goal\.language"):
-        build(plain(cfg.task), "task")
+        build(to_plain(cfg.task), "task")
 
 
 def test_an_experiment_may_have_options_of_another_job() -> None:

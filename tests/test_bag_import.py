@@ -17,9 +17,9 @@ from arm import ROBOT, SPEC
 from rosbags.rosbag2 import StoragePlugin
 
 from vla.config.build import build
-from vla.config.experiment import plain
+from vla.config.experiment import to_plain
 from vla.deploy.bag_import import BagDemonstrations, _Bag, _Picture, _Segment
-from vla.deploy.observer import Measured
+from vla.deploy.observer import JointMeasurement
 from vla.deploy.record import BagRecorder
 from vla.deploy.settings import Topics
 from vla.io.errors import UserError
@@ -95,7 +95,7 @@ def test_joint_positions_of_any_robot_are_learned_from_a_bag_alone(bag: Path) ->
     images = [f"expert.topics.images.{camera}={topic}" for camera, topic in TOPICS.images.items()]
     chosen = ("task=recorded", "task.joints=all", "task.units=rad", "task.image_size=[8,8]", "expert=bag")
     robot = "expert.robot.fingers=[left,right]"
-    config: Any = plain(composing.composed(*chosen, f"expert.folder={bag}", robot, *topics, *images))
+    config: Any = to_plain(composing.composed(*chosen, f"expert.folder={bag}", robot, *topics, *images))
     spec = build(config["task"], "task").spec
     assert (spec.control_hz, spec.cameras, spec.action) == (10.0, ("front", "wrist"), tuple(ROBOT.joints))
     demonstrations = build(config["expert"], "expert", spec=spec)
@@ -145,7 +145,7 @@ def test_steps_have_the_rate_of_the_task_whatever_that_of_the_cameras(fps: float
     demonstrations.spec = replace(SPEC, cameras=("front",))
     bag: Any = SimpleNamespace(folder="bag", inputs=[])
     for tick in range(500):  # ten seconds
-        bag.inputs.append((0.02 * tick, Measured(0.02 * tick, np.zeros(7), np.zeros(7), 0.0)))
+        bag.inputs.append((0.02 * tick, JointMeasurement(0.02 * tick, np.zeros(7), np.zeros(7), 0.0)))
     bag.inputs += [(at, _Picture("front", at)) for at in np.arange(0, 10, 1 / fps)]
     bag.inputs.sort(key=lambda each: each[0])
     steps = demonstrations._steps(bag, _Segment("go", False, 0.0, 10.0))

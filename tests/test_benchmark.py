@@ -21,7 +21,7 @@ from vla.parallel.limits import cores
 def test_an_evaluation_without_a_trained_policy_is_refused_before_other_stages(tmp_path: Path) -> None:
     asked = ("benchmark.names=[collect,evaluate]", f"output={tmp_path}/run", f"collect.folder={tmp_path}/episodes")
     with pytest.raises(UserError, match=r"plays a trained policy: add checkpoint=RUN"):
-        run(Experiment.of(composed("job=benchmark", *asked)))
+        run(Experiment.from_config(composed("job=benchmark", *asked)))
     assert not list(tmp_path.iterdir())
 
 
@@ -50,7 +50,7 @@ def test_a_benchmark_says_where_its_figures_are(
 ) -> None:
     monkeypatch.setattr(acting, "policy", lambda experiment: {"policy": measure(3.0, "ms", 5, 2.0)})
     with caplog.at_level("INFO", "vla"):
-        run(Experiment.of(composed("job=benchmark", "benchmark.names=[policy]", f"output={tmp_path}")))
+        run(Experiment.from_config(composed("job=benchmark", "benchmark.names=[policy]", f"output={tmp_path}")))
     assert caplog.messages[-1] == f"wrote {tmp_path / 'benchmark.json'}" and (tmp_path / "benchmark.json").is_file()
 
 
@@ -70,7 +70,7 @@ def test_another_implementation_of_equal_actions_is_the_floor_of_a_plan(
     monkeypatch.setenv("VLA_TRUST", "test_benchmark")
     peer = {"_target_": "test_benchmark.Peer", "_partial_": True, "error": 0.0}
     small = ("benchmark.steps=3", "collect.episodes=1", f"collect.folder={tmp_path}", "task.image_size=[32,32]")
-    experiment = Experiment.of(composed("job=benchmark", *small)).with_values({"benchmark.peer": peer})
+    experiment = Experiment.from_config(composed("job=benchmark", *small)).with_values({"benchmark.peer": peer})
     found = acting.policy(experiment)["policy"]
     assert found["n"] == 3 and found["floor"] > 0
     with pytest.raises(UserError, match=r"benchmark.peer plans other actions: they differ by \d"):

@@ -83,7 +83,7 @@ def test_a_store_that_was_put_together_says_of_what(tmp_path: Path) -> None:
 
 
 def test_of_very_many_draws_some_are_shown(tmp_path: Path, figures: list[Figure], monkeypatch: Any) -> None:
-    monkeypatch.setattr(dataset_card, "DRAWN", 3)
+    monkeypatch.setattr(dataset_card, "MAX_DRAW_PANELS", 3)
     draws = [{f"d{number}": float(seed * (number + 1)) for number in range(9)} for seed in range(5)]
     described(add(tmp_path, [replace(each, draws=drawn) for each, drawn in zip(EPISODES, draws, strict=True)]))
     assert {axes.get_title() for axes in figures[0].axes} >= {"d0", "d1", "d2"}

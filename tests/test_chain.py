@@ -83,7 +83,7 @@ def test_every_instruction_is_possible_where_those_before_leave_the_blocks() -> 
             assert ("block", block) not in now.spots.values()  # nothing stands on it
             assert now.held in (None, block)  # what is in the hand is put down first
             if isinstance(goal, Stack):
-                assert not now.stacked(referents.blocks[1])
+                assert not now.is_stacked(referents.blocks[1])
             elif not isinstance(goal, Lift):
                 assert ("pad", referents.pads[0]) not in now.spots.values()
             after = goal.after(now, referents)
@@ -119,7 +119,7 @@ def test_the_next_instruction_comes_when_one_is_completed(chain: Tabletop, tmp_p
     assert list(dict.fromkeys(said)) == wanted == agent.heard and len(wanted) == 3
     assert episode.success and episode.completed == (3, 3) and episode.task == "chain"
     with chain.blind():
-        assert replay(chain, episode).differs is None
+        assert replay(chain, episode).first_difference is None
     file = tmp_path / f"{recording_name(FIRST, 'success')}.rrd"
     [entry] = RrdReader(file).recordings()
     [chunk] = RrdReader(file).store(store=entry).stream().filter(content=["/instruction"]).to_chunks()
@@ -146,7 +146,7 @@ def test_a_demonstration_has_one_instruction_and_begins_where_those_before_it_en
             assert episode.success and episode.completed is None and episode.task in GOALS
             assert {seen.instruction for seen in episode.observations} == {episode.draws["language"]["instruction"]}
             assert "then" not in episode.draws["language"]
-            assert replay(chain, episode).differs is None
+            assert replay(chain, episode).first_difference is None
             starts.append(chain.simulation.compiled.data.time - len(episode.observations) / 10)
     assert min(starts) == pytest.approx(0) and max(starts) > 1  # [s] of the instructions before
 
@@ -175,7 +175,7 @@ def test_a_chain_is_also_asked_for_with_other_blocks(chain: Tabletop) -> None:
 
 def test_a_report_tells_how_many_were_completed_in_a_row(tmp_path: Path) -> None:
     report = in_a_row(4, 4, 2, 0)
-    assert report.in_a_row == {"1/4": 3, "2/4": 3, "3/4": 2, "4/4": 2}
+    assert report.completion_counts == {"1/4": 3, "2/4": 3, "3/4": 2, "4/4": 2}
     lines = str(report).splitlines()
     assert "2/4 3/4 (75.0 %, 95 % CI 30.1-95.4)" in lines
     assert any(line.startswith("completed in a row on average 2.50 (95 % CI ") for line in lines)
@@ -190,7 +190,7 @@ def test_a_report_tells_how_many_were_completed_in_a_row(tmp_path: Path) -> None
 
 def test_episodes_of_one_instruction_have_no_such_rates() -> None:
     report = Report((Result(FIRST_SEED, "success"),))
-    assert report.mean_in_a_row is None and not summary(report)["in_a_row"] and "completed" not in str(report)
+    assert report.mean_completed is None and not summary(report)["in_a_row"] and "completed" not in str(report)
 
 
 def test_the_interval_of_a_bounded_mean() -> None:

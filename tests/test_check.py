@@ -16,7 +16,7 @@ from saved_policies import save_policy
 from vla import jobs
 from vla.config.adopt import adopt
 from vla.config.build import build
-from vla.config.experiment import Experiment, plain
+from vla.config.experiment import Experiment, to_plain
 from vla.config.resolvers import digest
 from vla.models.policy_folder import require_unseen
 
@@ -156,7 +156,7 @@ def test_a_class_stands_only_where_its_kind_is_asked_for() -> None:
 
 
 def test_a_class_takes_the_arguments_of_its_base_classes_too() -> None:
-    node = plain(composed("model=act").model)
+    node = to_plain(composed("model=act").model)
     for changes, message in (
         ({"width_": 3}, "model.width_ is unknown, did you mean width?"),
         ({"chunk": 0}, "model.chunk must be greater than or equal to 1, got 0"),
@@ -171,7 +171,7 @@ def test_a_class_takes_the_arguments_of_its_base_classes_too() -> None:
 
 def test_build_passes_on_what_a_nested_constructor_complains_about() -> None:
     with pytest.raises(ValueError, match="so it replaces no word"):
-        build(plain(config(**{"task.goal.language.phrasings": ["{block}"]}).task), "task")
+        build(to_plain(config(**{"task.goal.language.phrasings": ["{block}"]}).task), "task")
 
 
 def test_what_is_checked_is_what_is_built() -> None:
@@ -283,7 +283,7 @@ def test_what_is_removed_from_the_command_line_is_told_before_any_work() -> None
     OmegaConf.set_struct(cfg, False)
     del cfg.logger, cfg.recorder
     check(cfg)
-    assert Experiment.of(cfg)["logger"] is None and Experiment.of(cfg).make_recorder(Path()) is None
+    assert Experiment.from_config(cfg)["logger"] is None and Experiment.from_config(cfg).make_recorder(Path()) is None
     del cfg.trainer.max_steps
     with pytest.raises(ValueError, match=r"trainer\.max_steps is missing: trainings need it"):
         check(cfg)
@@ -398,7 +398,7 @@ def test_a_checkpoint_is_not_evaluated_on_what_selected_it_whatever_is_validated
         cfg = composed(*(each.replace("RUN", str(path)) for each in overrides), validated, f"output={tmp_path}/out")
         check(cfg)
         with pytest.raises(ValueError, match=rf"^{key}=\d+: episodes {shared} selected the weights in .*theirs"):
-            jobs.run(Experiment.of(cfg))
+            jobs.run(Experiment.from_config(cfg))
 
 
 def test_a_checkpoint_may_be_evaluated_on_all_that_did_not_select_it(tmp_path: Path) -> None:

@@ -27,15 +27,15 @@ from toy import SPEC, ToyEnvironment, make_environment
 from vla.config.build import build
 from vla.config.experiment import Experiment
 from vla.jobs.evaluate import require_possible
-from vla.models.chunking import Chunking, Guided, Running, TrainedPrefix, require_fit
+from vla.models.chunking import Chunking, Guided, RunningPlans, TrainedPrefix, require_fit
 from vla.models.flow import Flow
 from vla.models.vlm.policy import VisionLanguageAction
-from vla.rollouts.realtime import Network, OverNetwork, make_over_network
+from vla.rollouts.realtime import Network, NetworkedAgent, make_networked
 from vla.rollouts.rollout import AgentFactory, rollout
 from vla.rollouts.shared_policy import shared_policy
 from vla.schedule import Delays, Schedule
 from vla.spec import FIRST_SEED, Array, Observation, Spec
-from vla.spec import Running as RunningPlan
+from vla.spec import RunningPlan as RunningPlan
 
 METHODS: dict[str, Callable[[], Chunking]] = {
     "guided": lambda: Guided(**defaults_of("policy/chunking/guided")),
@@ -51,10 +51,10 @@ def make_flow(**options: Any) -> Flow:
     return make_denoising(Flow, **{"chunk": 8, "execute": 2, "prefix": 4, **options})  # type: ignore[return-value]
 
 
-def running_of(actions: Tensor, remaining: int, delay: int) -> Running:
+def running_of(actions: Tensor, remaining: int, delay: int) -> RunningPlans:
     """Running plans, all as long."""
     counts = (torch.full((len(actions),), count) for count in (remaining, delay))
-    return Running(actions, *counts)
+    return RunningPlans(actions, *counts)
 
 
 def test_lerobot_guides_likewise() -> None:
@@ -70,7 +70,7 @@ def test_lerobot_guides_likewise() -> None:
                 return -(noisy @ given["matrix"] + time).tanh()
 
             method = Guided(jacobian=False, decay=decay, limit=limit)
-            guided = method.continued(velocity, running_of(given["previous"], int(rest), int(delay)))
+            guided = method.continuing_velocity(velocity, running_of(given["previous"], int(rest), int(delay)))
             mine = guided(given["noisy"], torch.full((2,), 1 - time))
             assert (mine + theirs).abs().max() <= 1e-5 * theirs.abs().max()
 
@@ -79,7 +79,7 @@ def test_as_published_the_guidance_goes_back_through_the_network() -> None:
     """For a linear velocity a M the estimate is a (I + (1 - t) M), whose Jacobian is known."""
     noisy, plan, matrix, t = torch.randn(2, 8, 3), torch.randn(2, 8, 3), torch.randn(3, 3), 0.4
     running, time = running_of(plan, 6, 2), torch.full((2,), t)
-    guided = Guided(True, "exponential", 100.0).continued(lambda noisy, time: noisy @ matrix, running)
+    guided = Guided(True, "exponential", 100.0).continuing_velocity(lambda noisy, time: noisy @ matrix, running)
     falling = torch.tensor([1, 1, 4 / 5, 3 / 5, 2 / 5, 1 / 5, 0, 0])  # two are certain, four more remain
     weights = falling * (falling.exp() - 1) / (np.e - 1)
     slope = torch.eye(3) + (1 - t) * matrix
@@ -88,7 +88,7 @@ def test_as_published_the_guidance_goes_back_through_the_network() -> None:
     assert torch.allclose(guided(noisy, time), expected, atol=1e-5)
     with torch.inference_mode():
         assert torch.allclose(guided(noisy, time), expected, atol=1e-5)
-    limited = Guided(True, "exponential", 5.0).continued(lambda noisy, time: noisy @ matrix, running)
+    limited = Guided(True, "exponential", 5.0).continuing_velocity(lambda noisy, time: noisy @ matrix, running)
     start = noisy @ matrix + 5 * weights[:, None] * (plan - noisy @ (slope := torch.eye(3) + matrix)) @ slope.T
     assert torch.allclose(limited(noisy, torch.zeros(2)), start, atol=1e-4)
 
@@ -101,8 +101,8 @@ def test_the_network_is_given_the_certain_actions_as_clean() -> None:
         return noisy
 
     noisy, plan = torch.randn(2, 4, 3), torch.randn(2, 4, 3)
-    running = Running(plan, torch.tensor([3, 0]), torch.tensor([2, 0]))
-    TrainedPrefix().continued(velocity, running)(noisy, torch.full((2,), 0.25))
+    running = RunningPlans(plan, torch.tensor([3, 0]), torch.tensor([2, 0]))
+    TrainedPrefix().continuing_velocity(velocity, running)(noisy, torch.full((2,), 0.25))
     ((seen, times),) = given
     assert torch.equal(seen[0, :2], plan[0, :2]) and torch.equal(seen[0, 2:], noisy[0, 2:])
     assert torch.equal(seen[1], noisy[1])
@@ -112,7 +112,7 @@ def test_the_network_is_given_the_certain_actions_as_clean() -> None:
 @pytest.mark.parametrize("method", list(METHODS.values())[:2])
 def test_without_a_running_plan_the_velocity_stays_as_it_is(method: Callable[[], Chunking]) -> None:
     noisy, time = torch.randn(2, 8, 3), torch.full((2,), 0.3)
-    velocity = method().continued(lambda noisy, time: noisy.sin(), running_of(torch.randn(2, 8, 3), 0, 0))
+    velocity = method().continuing_velocity(lambda noisy, time: noisy.sin(), running_of(torch.randn(2, 8, 3), 0, 0))
     assert torch.equal(velocity(noisy, time), noisy.sin())
 
 
@@ -225,7 +225,7 @@ class Watched:
 def test_over_a_network_the_arm_does_what_every_plan_begins_with(method: Callable[[], Chunking]) -> None:
     """The second observation is sent at step 2, then at 5, 8 …, each time when the plan of the one before arrives."""
     agent = Watched(method())
-    distant = OverNetwork(agent, NETWORK, SPEC)
+    distant = NetworkedAgent(agent, NETWORK, SPEC)
     distant.reset("", 3)
     acted = [distant.act(seen) for seen in observations(20)]
     starts = [0, 2, 5, 8, 11, 14, 17]
@@ -245,7 +245,7 @@ def test_episodes_over_a_network_are_repeatable_wherever_the_policy_is() -> None
     policy = as_policy(make_flow(), chunking=TrainedPrefix(), lanes=2)
 
     def executed(make_agent: AgentFactory) -> Array:
-        with closing(make_over_network(make_agent, NETWORK, make_environment())) as agent:
+        with closing(make_networked(make_agent, NETWORK, make_environment())) as agent:
             return rollout(make_environment(), agent, FIRST_SEED).executed
 
     beside = executed(lambda _: policy)
@@ -262,21 +262,21 @@ def test_episodes_over_a_network_are_repeatable_wherever_the_policy_is() -> None
 
 def test_a_delay_is_forecast_by_the_longest_of_the_last_ten() -> None:
     delays = Delays(0.1)
-    assert delays.longest == 0
+    assert delays.forecast == 0
     for seconds, longest in ((0.2, 2), (0.31, 4), (0.05, 4)):
         delays.add(seconds)
-        assert delays.longest == longest
+        assert delays.forecast == longest
     for _ in range(9):
         delays.add(0.05)
-    assert delays.longest == 1
+    assert delays.forecast == 1
 
 
 def test_a_schedule_tells_what_remains_of_a_plan() -> None:
     schedule = Schedule[str](0.5)
-    assert list(schedule.remaining(1.0)) == [] and schedule.executed(2) == -np.inf
+    assert list(schedule.remaining_actions(1.0)) == [] and schedule.execution_end(2) == -np.inf
     schedule.add("abcd", 1.0)
-    assert [*map("".join, map(schedule.remaining, (1.0, 1.4, 2.0, 3.0)))] == ["abcd", "abcd", "cd", ""]
-    assert schedule.executed(3) == 2.5
+    assert [*map("".join, map(schedule.remaining_actions, (1.0, 1.4, 2.0, 3.0)))] == ["abcd", "abcd", "cd", ""]
+    assert schedule.execution_end(3) == 2.5
 
 
 def test_what_cannot_continue_plans_is_refused() -> None:
@@ -310,9 +310,9 @@ def test_before_any_work_chunking_must_go_with_the_model(overrides: list[str], s
 
 def test_before_any_work_plans_must_be_long_enough_for_the_network(tmp_path: Path) -> None:
     config = [f"output={tmp_path}", "model=flow", "evaluate=latency", "+policy/chunking=guided"]
-    require_possible(Experiment.of(composed(*config)))
+    require_possible(Experiment.from_config(composed(*config)))
     with pytest.raises(ValueError, match=r"begin 3 actions apart and arrive 3 late, when .* model\.chunk=5, is over"):
-        require_possible(Experiment.of(composed(*config, "model.chunk=5")))
+        require_possible(Experiment.from_config(composed(*config, "model.chunk=5")))
 
 
 VLAS: dict[str, tuple[Callable[..., VisionLanguageAction], Spec]] = {

@@ -89,9 +89,9 @@ def start(folder: Path, until: int, workers: int = 2, episodes: int = EPISODES) 
 def test_two_workers_leave_the_same_bytes_as_one(tmp_path: Path, whole: Path) -> None:
     summary, store = gather(tmp_path, workers=2), EpisodeStore(tmp_path)
     assert content(tmp_path) == content(whole)
-    assert (summary.episodes, summary.added, summary.tried) == (EPISODES, EPISODES, TRIED)
+    assert (summary.episodes, summary.added, summary.attempts) == (EPISODES, EPISODES, TRIED)
     assert summary.failures == {"timeout": TRIED - EPISODES} and summary.success_rate == EPISODES / TRIED
-    assert [entry.seed for entry in store.tried] == list(range(TRIED))
+    assert [entry.seed for entry in store.attempts] == list(range(TRIED))
     assert all(entry.seed % 5 != 3 for entry in store.episodes)
 
 
@@ -116,13 +116,13 @@ def test_tasks_that_the_seed_tells_get_equal_shares_at_any_time(tmp_path: Path) 
     store = EpisodeStore(tmp_path)
     for rounds in range(1, 9):
         assert Counter(entry.task for entry in store.episodes[: 3 * rounds]) == dict.fromkeys("abc", rounds)
-    assert [entry.seed for entry in store.tried] == list(range(len(store.tried)))
-    passed = [entry.task for entry in store.tried if entry.outcome == NOT_NEEDED]
+    assert [entry.seed for entry in store.attempts] == list(range(len(store.attempts)))
+    passed = [entry.task for entry in store.attempts if entry.outcome == NOT_NEEDED]
     assert passed and "b" not in passed
     # Of seeds that were passed over, nothing is known: neither the expert's success nor its failures count them.
-    assert summary.tried == len(store.tried) - len(passed) and {*summary.failures} == {"timeout"}
+    assert summary.attempts == len(store.attempts) - len(passed) and {*summary.failures} == {"timeout"}
     assert summary.tasks["a"][0] == summary.tasks["b"][0] == 8 < summary.tasks["b"][1]
-    assert verify_store(store).success_rate == summary.success_rate == 24 / summary.tried
+    assert verify_store(store).success_rate == summary.success_rate == 24 / summary.attempts
 
 
 def test_shares_depend_neither_on_workers_nor_on_interruptions(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_killed_at_random_moments_it_loses_and_doubles_nothing(tmp_path: Path, l
         assert before + kill % 2 <= lines(folder)
         if (folder / "store.json").exists():
             store = EpisodeStore(folder)
-            assert [entry.seed for entry in store.tried] == list(range(len(store.tried)))
+            assert [entry.seed for entry in store.attempts] == list(range(len(store.attempts)))
             assert all(store.read(entry)["action"].shape[0] == entry.steps for entry in store.episodes)
     gather(folder, episodes=2 * EPISODES)
     assert content(folder) == content(larger)
@@ -184,7 +184,7 @@ def test_a_second_job_waits_for_the_first_and_uses_its_episodes(
 def test_a_worker_that_dies_is_reported_and_costs_nothing(tmp_path: Path, whole: Path) -> None:
     with pytest.raises(ValueError, match=r"a worker process crashed twice: it ended with exit status 1; .* safe"):
         gather(tmp_path, workers=2, make_environment=toy.make_deadly_environment)
-    assert [entry.seed for entry in EpisodeStore(tmp_path).tried] == list(range(lines(tmp_path)))
+    assert [entry.seed for entry in EpisodeStore(tmp_path).attempts] == list(range(lines(tmp_path)))
     gather(tmp_path)
     assert content(tmp_path) == content(whole)
 
@@ -193,7 +193,7 @@ def test_demonstrations_never_come_from_the_seeds_of_evaluations(tmp_path: Path)
     store = EpisodeStore.create_or_open(tmp_path, toy.SPEC, {})
     with pytest.raises(ValueError, match="seeds from 1000000 on are reserved for evaluation"):  # one fails
         collect(store, toy.make_environment, toy.make_expert, 4, Cluster(1, "beside"), FIRST_SEED - 4)
-    assert store.episodes and all(entry.seed < FIRST_SEED for entry in store.tried)
+    assert store.episodes and all(entry.seed < FIRST_SEED for entry in store.attempts)
 
 
 def test_an_expert_without_hope_is_given_up(tmp_path: Path) -> None:
@@ -239,7 +239,7 @@ def test_an_expert_that_does_not_look_leaves_the_same_demonstrations_from_fewer_
     ids=" ".join,
 )
 def test_images_drawn_in_the_replay_are_those_of_the_rollout(world: tuple[str, ...]) -> None:
-    experiment = Experiment.of(composed(*world, "task.image_size=[48,64]"))
+    experiment = Experiment.from_config(composed(*world, "task.image_size=[48,64]"))
     worker = DemonstrationWorker(experiment.make_environment(), experiment.make_expert())
     seed, episode = next((seed, found) for seed in range(20) if (found := worker.attempt(seed)).success)
     environment = experiment.make_environment()()

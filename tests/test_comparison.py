@@ -15,7 +15,7 @@ from vla.rollouts.comparison import (
     Pairs,
     compare_amounts,
     compare_samples,
-    concluded,
+    conclude_cases,
     fisher,
     median_interval,
     newcombe,
@@ -68,14 +68,14 @@ def test_p_values_are_adjusted_step_by_step() -> None:
     cases = {
         name: {SUCCESS: a_comparison(p), **others} for name, p in zip("abcd", (0.01, 0.04, 0.03, 0.005), strict=True)
     }
-    found = concluded(cases, 0.02)
+    found = conclude_cases(cases, 0.02)
     assert list(found) == list("abcd")
     assert [each[SUCCESS].p_holm for each in found.values()] == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert {each["grasped"].p_holm for each in found.values()} == {1.0}
     # Pairs that never differ could not have told anything.
-    found = concluded({"a": {SUCCESS: a_comparison(0.03)}, "b": {SUCCESS: a_comparison(1.0, 0.0, differ=0)}}, 0.02)
+    found = conclude_cases({"a": {SUCCESS: a_comparison(0.03)}, "b": {SUCCESS: a_comparison(1.0, 0.0, differ=0)}}, 0.02)
     assert [each[SUCCESS].p_holm for each in found.values()] == pytest.approx([0.03, 1.0])
-    assert concluded({}, 0.02) == {}
+    assert conclude_cases({}, 0.02) == {}
 
 
 def test_the_interval_of_a_median_is_scipys() -> None:

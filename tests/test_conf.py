@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 from vla.config.compose import axes
 from vla.config.compose import compose as compose_whole
 from vla.config.differences import differences
-from vla.config.experiment import Experiment, plain
+from vla.config.experiment import Experiment, to_plain
 from vla.robots.cartesian import LIMIT_MARGIN
 from vla.robots.panda import FINGER_TRAVEL, JOINT_HIGH, JOINT_LOW, JOINT_SPEED
 from vla.spec import FIRST_SEED
@@ -108,17 +108,17 @@ GRIDS = [(name, variant) for name in ("ablation", "images_alone", "recipe") for 
 @pytest.mark.parametrize(("experiment", "variant"), GRIDS, ids=map("=".join, GRIDS))
 def test_every_variant_of_a_grid_is_a_model(experiment: str, variant: str, tabletop: Tabletop) -> None:
     config = composed(f"experiment={experiment}", *variants(experiment)[variant])
-    learner = Experiment.of(config).learner(tabletop.spec)
+    learner = Experiment.from_config(config).learner(tabletop.spec)
     assert sum(weight.numel() for weight in learner.model.parameters()) > 10_000
-    first = plain(composed(f"experiment={experiment}"))
-    changed = [key for key, *_ in differences(first, plain(config)) if not key.startswith("chosen")]
+    first = to_plain(composed(f"experiment={experiment}"))
+    changed = [key for key, *_ in differences(first, to_plain(config)) if not key.startswith("chosen")]
     assert (variant == "none") == (not changed)
 
 
 @pytest.mark.parametrize(("experiment", "variant"), [GRIDS[-1], ("ablation", "no_transformer")])
 def test_a_variant_is_what_one_would_type(experiment: str, variant: str) -> None:
     typed = composed(f"experiment={experiment}", *variants(experiment)[variant])
-    assert plain(composed(f"experiment={experiment}", f"variant={variant}")) == plain(typed)
+    assert to_plain(composed(f"experiment={experiment}", f"variant={variant}")) == to_plain(typed)
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_an_axis_is_applied_at_its_place_however_it_was_switched_on() -> None:
 def test_intensity_and_colour_of_the_light_are_changed_one_at_a_time(level: str) -> None:
     cfg = composed("evaluate=suite", f"task/randomize={level}")
     check(cfg)
-    suite = Experiment.of(cfg).evaluate.changes
+    suite = Experiment.from_config(cfg).evaluate.changes
     hard, intensity, colour = (
         suite[f"light{name}_hard"]["randomize"]["light"] for name in ("", "_intensity", "_colour")
     )
@@ -180,7 +180,7 @@ def test_intensity_and_colour_of_the_light_are_changed_one_at_a_time(level: str)
 
 
 def test_the_suite_has_every_axis_by_itself_at_each_level() -> None:
-    suite = Experiment.of(composed("evaluate=suite")).evaluate.changes
+    suite = Experiment.from_config(composed("evaluate=suite")).evaluate.changes
     levels = {level: composed(f"task/randomize={level}").task.randomize for level in ("wide", "hard")}
     for level in levels:  # no level of all axes has it
         assert levels[level]["disturbance"] is None
@@ -208,9 +208,9 @@ def test_a_model_stands_in_one_file() -> None:
 
 
 def test_a_model_changes_nothing_but_itself() -> None:
-    default = plain(composed())
+    default = to_plain(composed())
     for model in MODELS:
-        other = plain(composed(f"model={model}"))
+        other = to_plain(composed(f"model={model}"))
         assert {name for name in default if other[name] != default[name]} <= {"model", "chosen"}, model
 
 

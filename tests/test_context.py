@@ -12,7 +12,7 @@ from observing import act, observations
 from toy import SPEC
 
 from vla.config.build import build
-from vla.config.experiment import plain
+from vla.config.experiment import to_plain
 from vla.models.model import ContextModel
 from vla.models.tokenizers.tokenizer import Uniform
 
@@ -28,12 +28,12 @@ def made(head: str, context: str, **options: Any) -> ContextModel:
 def test_a_context_has_its_length_and_sees_images_state_and_instruction(context: str) -> None:
     model = made("act", context).eval()
     batch = with_text(model, make_batch(model.history, 2))
-    encoded = model.encoded(batch)
+    encoded = model.encode_context(batch)
     assert encoded.tokens.shape == (4, model.context.length, 32) and encoded.summary.shape == (4, 32)
     assert encoded.padding is None or encoded.padding.shape == encoded.tokens.shape[:2]
     other = {"rgb": {"eye": 255 - batch["rgb"]["eye"]}, "state": batch["state"] + 1, "text": batch["text"].roll(1, 0)}
     for name in other:
-        changed = model.encoded({**batch, name: other[name]})
+        changed = model.encode_context({**batch, name: other[name]})
         assert not torch.allclose(changed.summary, encoded.summary, atol=1e-4)
 
 
@@ -62,10 +62,10 @@ def test_tokens_are_kept_and_those_of_absent_frames_do_not_matter(head: str) -> 
 
 
 def test_an_option_chooses_the_context() -> None:
-    flow = plain(composed("model=flow", "model/context=tokens", "model.context.history=3"))["model"]
+    flow = to_plain(composed("model=flow", "model/context=tokens", "model.context.history=3"))["model"]
     assert flow["_target_"].endswith("Flow") and flow["context"]["_target_"].endswith("TokenContext")
     tokenizer = Uniform(64, 0.05, 0.0, 0, spec=SPEC)
     assert build(flow, "model", spec=SPEC, tokenizer=tokenizer).history == 3
-    rt1 = plain(composed("model=rt1_tiny", "model/context=keypoints"))["model"]
+    rt1 = to_plain(composed("model=rt1_tiny", "model/context=keypoints"))["model"]
     with pytest.raises(ValueError, match=r"model\.context must be .*TokenContext"):
         build(rt1, "model", spec=SPEC, tokenizer=tokenizer)

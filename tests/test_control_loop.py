@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from arm import ARM, FORWARD, ROBOT, SAFETY, SPEC
 
-from vla.deploy.control_loop import REPEATED, ControlLoop
+from vla.deploy.control_loop import REPETITION_TIME, ControlLoop
 from vla.deploy.motion import LEEWAY, Command
-from vla.deploy.observer import Measured
+from vla.deploy.observer import JointMeasurement
 from vla.deploy.safety import Safety, State
 from vla.robots.panda import HOME, JOINT_HIGH, forward
 from vla.spec import Observation
@@ -35,7 +35,9 @@ class World:
         for tick in range(round(seconds * 50)):
             self.now += 0.02
             if self.measures:
-                self.loop.observer.add_joint_state(Measured(self.now, self.joints, np.zeros_like(self.joints), 0.08))
+                self.loop.observer.add_joint_state(
+                    JointMeasurement(self.now, self.joints, np.zeros_like(self.joints), 0.08)
+                )
             if tick % 5 == 0:
                 for camera in self.cameras:
                     self.loop.observer.add_image(camera, IMAGE, self.now - (self.apart if camera == "wrist" else 0.0))
@@ -102,7 +104,7 @@ def test_whether_the_arm_follows_a_plan_is_told(world: World) -> None:
 def test_an_arm_is_not_taken_over_where_it_was_long_ago() -> None:
     world = World()
     world.measures = False
-    world.loop.observer.add_joint_state(Measured(world.now - SAFETY.joints_age, HOME + 0.1, np.zeros(7), 0.08))
+    world.loop.observer.add_joint_state(JointMeasurement(world.now - SAFETY.joints_age, HOME + 0.1, np.zeros(7), 0.08))
     assert world.run(0.2) == [] and "no joint state within" in world.loop.reason
     world.measures = True
     assert world.run(0.2)[0].position == pytest.approx(HOME)
@@ -214,7 +216,7 @@ def test_a_frame_counts_once_every_camera_has_a_newer_one(world: World) -> None:
 
     def after(*cameras: str) -> State:
         world.now += 0.01
-        world.loop.observer.add_joint_state(Measured(world.now, world.joints, np.zeros(7), 0.08))
+        world.loop.observer.add_joint_state(JointMeasurement(world.now, world.joints, np.zeros(7), 0.08))
         for camera in cameras:
             world.loop.observer.add_image(camera, IMAGE, world.now)
         world.loop.command(world.now)
@@ -262,7 +264,7 @@ def test_the_next_instruction_ends_a_stop_by_time_out_and_no_other() -> None:
         world.run(0.5)
     assert world.loop.state is State.STOPPED
     assert world.loop.reason == "time-out: 1 s on one instruction; to continue: send the next instruction"
-    world.run(REPEATED)
+    world.run(REPETITION_TIME)
     assert world.loop.on_instruction("go", world.now)
     world.run(0.5)
     assert world.loop.state is State.RUNNING
@@ -338,7 +340,7 @@ def test_an_arm_in_the_hands_of_a_person_is_not_commanded_and_goes_on_from_where
         (lambda world: setattr(world, "measures", False), "no joint state within"),
         (
             lambda world: world.loop.observer.add_joint_state(
-                Measured(world.now, world.joints + 0.01, np.zeros(7), 0.08)
+                JointMeasurement(world.now, world.joints + 0.01, np.zeros(7), 0.08)
             ),
             "still moves",
         ),
@@ -478,7 +480,7 @@ def test_the_horizon_is_continuous_with_the_commands(actions: int, longest: floa
     world.begin()
     sent: list[np.ndarray] = []
     for command in world.ticks(1.0):
-        _, *planned = world.loop.motion.ahead(command, world.now, longest)
+        _, *planned = world.loop.motion.trajectory_to_rest(command, world.now, longest)
         ahead = [each.position for each in planned]
         assert not planned[-1].velocity.any()
         sent.append(command.position)
@@ -522,7 +524,7 @@ def test_an_arm_that_follows_each_trajectory_until_the_next_stays_within_the_lim
         since, points = sent
         at = (np.arange(since, world.now, 0.001) - since) * 50
         path += list(np.stack([np.interp(at, range(len(points)), joints) for joints in np.transpose(points)], axis=1))
-        ahead = [each.position for each in loop.motion.ahead(command, world.now, 0.3)]
+        ahead = [each.position for each in loop.motion.trajectory_to_rest(command, world.now, 0.3)]
         sent = world.now, [path[-1] if path else points[0], *ahead]
         world.now += late.choice([0.0, 0.01, 0.02, 0.06], p=[0.7, 0.1, 0.1, 0.1])
     speeds = np.diff(path, axis=0) / 0.001

@@ -16,10 +16,10 @@ import toy
 from collecting import until
 from reading import fit, windows
 
-from vla.data.datamodule import Prefetcher, held_out
+from vla.data.datamodule import Prefetcher, is_held_out
 from vla.data.episodes import EpisodeStore, observations_of
 from vla.data.verification import episode_of
-from vla.data.window_batches import WindowBatcher, perturbed
+from vla.data.window_batches import WindowBatcher, is_perturbed
 from vla.io.images import resize
 from vla.io.parts import Part
 from vla.parallel.pool import Cluster
@@ -40,7 +40,7 @@ def naive(store: EpisodeStore, row: int, history: int, chunk: int) -> dict[str, 
         seen = {name: values[max(step, 0)] * present for name, values in rows.items()}
         labels = [min(max(step + ahead, 0), entry.steps - 1) if present else 0 for ahead in range(chunk)]
         seen["labels"], seen["done"] = ([rows[name][label] for label in labels] for name in ("action", "executed"))
-        off = perturbed(rows["action"], rows["executed"], store.spec)
+        off = is_perturbed(rows["action"], rows["executed"], store.spec)
         seen["valid"] = [
             present and step + ahead < entry.steps and not off[step : step + ahead].any() for ahead in range(chunk)
         ]
@@ -132,10 +132,10 @@ def test_the_split_is_by_episode_and_does_not_move_when_episodes_are_added(folde
     assert set(few.held_out_windows) < set(many.held_out_windows)
     assert set(few.training_windows) < set(many.training_windows)
     for entry in EpisodeStore(folder).episodes:
-        side = many.held_out_windows if held_out(entry.seed, 0.2) else many.training_windows
+        side = many.held_out_windows if is_held_out(entry.seed, 0.2) else many.training_windows
         assert np.isin(np.arange(entry.start, entry.start + entry.steps), side).all()
     for fraction in (0.05, 0.1, 0.5):  # every stretch of seeds holds out its share
-        held, length = np.array([held_out(seed, fraction) for seed in range(10_000)]), round(2 / fraction)
+        held, length = np.array([is_held_out(seed, fraction) for seed in range(10_000)]), round(2 / fraction)
         assert abs(held.mean() - fraction) < 0.001
         assert all(held[first : first + length].any() for first in range(0, 10_000 - length))
 

@@ -46,7 +46,7 @@ def test_writing_with_a_cache_is_decoding_the_growing_sequence_again_and_again(m
     batch = with_motions(model)
     batch["present"][:2, :-1] = False
     with torch.inference_mode():
-        context = model.encoded(batch)
+        context = model.encode_context(batch)
         logits, tokens = model.generate(context)
         written = tokens[:, :0]
         for place in range(tokens.shape[1]):
@@ -68,7 +68,7 @@ def test_the_words_of_fast_tokens_come_with_the_policy(tmp_path: Path) -> None:
 
 def test_a_token_depends_on_those_before_it_and_on_no_later_one() -> None:
     model = make_decoder(chunk=2).eval()
-    context = model.encoded(with_motions(model))
+    context = model.encode_context(with_motions(model))
     tokens = torch.randint(64, (4, 5))
     embedded: list[torch.Tensor] = []
 
@@ -109,7 +109,7 @@ def test_writing_ends_when_all_have_ended() -> None:
     torch.nn.init.zeros_(model.head.weight)
     with torch.no_grad():
         model.head.bias.copy_(torch.eye(256)[model.tokenizer.end])
-    _, tokens = model.generate(model.encoded(with_motions(model)))
+    _, tokens = model.generate(model.encode_context(with_motions(model)))
     assert tokens.tolist() == [[model.tokenizer.end]] * 4
 
 

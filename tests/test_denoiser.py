@@ -117,7 +117,7 @@ def test_on_a_robot_the_noise_differs_between_episodes_and_repeats() -> None:
         if warm:
             inference.warm_up()
         for _ in range(2):
-            inference.start(seen, first=True)
+            inference.start(seen, is_first=True)
             while (taken := inference.take()) is None:
                 pass
             plans.append(taken[0])

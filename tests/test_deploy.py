@@ -209,7 +209,7 @@ def test_the_whole_loop_reports_and_its_bag_is_learned_from(home: Path, start: C
 
 def loop_of(output: Path, *overrides: str) -> Experiment:
     agent = ("agent=remote", "agent.url=ws://127.0.0.1:1")
-    return Experiment.of(composed("job=deploy", "deploy=loop", *agent, f"output={output}", *overrides))
+    return Experiment.from_config(composed("job=deploy", "deploy=loop", *agent, f"output={output}", *overrides))
 
 
 def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -133,10 +133,10 @@ def test_a_disturbed_episode_is_replayed_bit_for_bit_and_differs_from_an_undistu
     with world.blind():
         episode = rollout(world, Waypoint(world.spec), 2)
         events, draws = world.events, world.draws
-        assert replay(world, episode).differs is None and world.events == events
+        assert replay(world, episode).first_difference is None and world.events == events
         kept, axes["disturbance"] = axes["disturbance"], None
         try:
-            [(step, _)], differs = events, replay(world, episode).differs
+            [(step, _)], differs = events, replay(world, episode).first_difference
             assert differs is not None and differs >= step - 1  # until then, nothing has changed
             assert {**world.draws, "disturbance": draws["disturbance"]} == draws and not world.events
         finally:

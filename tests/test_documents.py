@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from vla.io.documents import MAX_DEPTH, STRICT, parse_json, read_json, read_resolved, read_yaml, resolved
+from vla.io.documents import MAX_DEPTH, STRICT, parse_json, read_json, read_resolved, read_yaml, resolve_config
 from vla.io.errors import UserError
 from vla.io.types import NonNegativeRange
 
@@ -39,7 +39,7 @@ def test_a_pipe_a_device_or_a_file_that_is_too_large_is_not_read(tmp_path: Path)
             read_json(tmp_path / name, Header)
     (tmp_path / "a.json").write_text("[0, 0, 0, 0]")
     with pytest.raises(UserError, match=r"a\.json has 12 bytes, more than the 4"):
-        read_json(tmp_path / "a.json", list, largest=4)
+        read_json(tmp_path / "a.json", list, max_bytes=4)
 
 
 @pytest.mark.parametrize(
@@ -80,17 +80,17 @@ def test_yaml_that_is_not_plain_is_refused_by_name(tmp_path: Path, text: str | b
 
 def test_a_configuration_out_of_a_file_is_plain_and_resolved() -> None:
     value = {"model": [1, None, {"a": ("$", "{}")}]}
-    assert repr(resolved(value, "store.json")) == repr({"model": [1, None, {"a": ["$", "{}"]}]})  # without tuples
+    assert repr(resolve_config(value, "store.json")) == repr({"model": [1, None, {"a": ["$", "{}"]}]})  # without tuples
     for value in ("a ${b}", {"${b}": 1}, {"a": [(1, {"b": "${c}"})]}, "${" + "x" * 10_000):
         with pytest.raises(UserError, match=r"^store\.json holds the reference '.*\$\{.*': only resolved") as caught:
-            resolved(value, "store.json")
+            resolve_config(value, "store.json")
         assert len(str(caught.value)) < 300
     for unusual in ({"a": object()}, [b"x"], {1}):
         with pytest.raises(UserError, match="which is no plain data"):
-            resolved(unusual, "store.json")
+            resolve_config(unusual, "store.json")
     for key in (5, True, math.nan, None, 1j):
         with pytest.raises(UserError, match=f"^store.json holds the key {key}, which is no text$"):
-            resolved({"a": {key: 1}}, "store.json")
+            resolve_config({"a": {key: 1}}, "store.json")
 
 
 def test_half_a_character_is_refused_before_anything_is_made_of_it(tmp_path: Path) -> None:

@@ -22,12 +22,12 @@ from vla.data.verification import episode_of
 
 def test_what_was_stored_is_read_back(tmp_path: Path) -> None:
     written, store = add(tmp_path, EPISODES), EpisodeStore(tmp_path)
-    assert store.tried == written.tried
+    assert store.attempts == written.attempts
     assert store.spec == ARM_SPEC
     assert [entry.seed for entry in store.episodes] == [0, 1, 2, 4]
-    assert store.tried[3].outcome == "timeout" and store.tried[3].steps == 0
+    assert store.attempts[3].outcome == "timeout" and store.attempts[3].steps == 0
     assert store.next_seed == 5
-    assert store.tried[0].draws["colour"] in ("red", "blue") and store.tried[0].draws["limit"] == 40
+    assert store.attempts[0].draws["colour"] in ("red", "blue") and store.attempts[0].draws["limit"] == 40
     assert len(store.rows("state")) == sum(entry.steps for entry in store.episodes)
     for entry in store.episodes:
         came, went = episode_of(store, entry), EPISODES[entry.seed]
@@ -97,7 +97,7 @@ def test_a_commit_cut_short_is_as_if_it_never_began(tmp_path: Path, tear: str, c
         missing = (whole / file).read_bytes()[(torn / file).stat().st_size :]
         with (torn / file).open("ab") as stream:
             stream.write(missing[: int(share * len(missing))])
-    assert [entry.seed for entry in EpisodeStore(torn).tried] == [0, 1, 2, 3]
+    assert [entry.seed for entry in EpisodeStore(torn).attempts] == [0, 1, 2, 3]
     add(torn, EPISODES[4:], codec)
     assert content(torn) == content(whole)
 
@@ -156,7 +156,7 @@ def test_an_episode_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     }.items():
         with store.writing(), pytest.raises(ValueError, match=says):
             store.append(episode)
-    assert EpisodeStore(tmp_path).tried == []
+    assert EpisodeStore(tmp_path).attempts == []
     add(tmp_path, EPISODES[:2])
     store = EpisodeStore(tmp_path)
     with store.writing(), pytest.raises(ValueError, match="expects seed 2 next, got seed 4"):
@@ -189,7 +189,7 @@ def test_nothing_is_written_behind_a_link(name: str, tmp_path: Path) -> None:
     (tmp_path / "store" / name).symlink_to(victim)
     victim.open("ab").write(b"x" * 9000)
     before = victim.read_bytes()
-    store = EpisodeStore(tmp_path / "store", damaged=True)
+    store = EpisodeStore(tmp_path / "store", allow_damage=True)
     assert [entry.seed for entry in store.episodes] == [0, 1, 2, 4]
     with pytest.raises(ValueError, match=rf"{re.escape(name)} is a link"), EpisodeStore(tmp_path / "store").writing():
         pass

@@ -15,7 +15,7 @@ from resuming import same, train
 from vla.io.errors import UserError
 from vla.models.vision.timm_encoders import FilmBackbone
 from vla.training import estimate
-from vla.training.estimate import Estimate, extrapolated
+from vla.training.estimate import Estimate, extrapolate
 
 SIZES = {"data": {"batch_size": 8}, "model": {"width": 64, "context": {"history": 3}}}
 
@@ -74,6 +74,6 @@ def test_what_the_memory_cannot_hold_is_refused_before_the_first_step(
 
 
 def test_small_batches_tell_of_large_ones_by_the_line_through_the_last_two() -> None:
-    assert extrapolated({0: 5.0, 1: 9.0, 4: 14.0, 16: 38.0}, 64) == 38 + 2 * 48
-    assert extrapolated({0: 5.0, 1: 9.0, 4: 14.0}, 4) == 14
-    assert extrapolated({0: 5.0, 1: 9.0}, 2) == 13
+    assert extrapolate({0: 5.0, 1: 9.0, 4: 14.0, 16: 38.0}, 64) == 38 + 2 * 48
+    assert extrapolate({0: 5.0, 1: 9.0, 4: 14.0}, 4) == 14
+    assert extrapolate({0: 5.0, 1: 9.0}, 2) == 13

@@ -17,11 +17,11 @@ from rerun.chunk import RrdReader
 
 from vla.config.experiment import Experiment
 from vla.jobs.evaluate import require_possible
-from vla.parallel.pool import Cluster, Crashed
+from vla.parallel.pool import Cluster, WorkerCrash
 from vla.reports.evaluation import summary, write_report
 from vla.rollouts import recordings
 from vla.rollouts.evaluate import _RolloutWorker, evaluate
-from vla.rollouts.recordings import chosen, keep_pictures, merge_recordings
+from vla.rollouts.recordings import choose_results, keep_pictures, merge_recordings
 from vla.rollouts.results import Report, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.runs.folder import read_report
@@ -58,13 +58,13 @@ def test_several_tasks_are_told_apart() -> None:
 def test_a_condition_without_an_episode_is_refused_before_any_is_played() -> None:
     asked = composed("task/randomize=wide", "task.blocks=6", "evaluate=language", "agent=expert")
     with pytest.raises(ValueError, match=r"condition impossible of the evaluation: task\.blocks must be from 2 to 5"):
-        require_possible(Experiment.of(asked))
+        require_possible(Experiment.from_config(asked))
 
 
 def test_the_report_of_rounds_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "round_0/checkpoints").mkdir(parents=True)
     with pytest.raises(ValueError, match="has the rounds of a job=improve, whose report this would replace"):
-        require_possible(Experiment.of(composed(f"output={tmp_path}", "agent=expert")))
+        require_possible(Experiment.from_config(composed(f"output={tmp_path}", "agent=expert")))
 
 
 def of_ten(**won: int) -> tuple[Result, ...]:
@@ -97,7 +97,7 @@ def test_a_tier_may_name_its_tasks_by_patterns() -> None:
     tiers = {"goal": ["goal*_0", "goal*_1"], "long": ["long*_0"]}
     played = [Result(n, "success", task=task) for n, task in enumerate(("goal_0", "goal_swap_1", "long_swap_0"))]
     report = Report(tuple(played), tiers)
-    assert {tier: part.episodes for tier, part in report.by_tier.items()} == {"goal": 2, "long": 1}
+    assert {tier: part.episodes for tier, part in report.tier_reports.items()} == {"goal": 2, "long": 1}
     assert report.mean_label == "mean over tiers"
     assert Report(tuple(played[1:]), tiers).mean_label == "mean over tiers (2 of 3 tasks)"
 
@@ -176,7 +176,7 @@ def test_what_no_report_can_hold_is_an_error_of_its_episode(tmp_path: Path) -> N
 @pytest.mark.parametrize("lanes", [1, 2])
 def test_only_the_episode_that_kills_its_process_is_an_error_also_of_those_side_by_side(lanes: int) -> None:
     makers, kept = (toy.make_deadly_environment, toy.make_agent, None), list[Result]()
-    report = evaluate(*makers, SEEDS, Cluster(2, "beside"), lanes=lanes, keep=kept.append)
+    report = evaluate(*makers, SEEDS, Cluster(2, "beside"), lanes=lanes, on_result=kept.append)
     assert [error.seed for error in report.errors] == [toy.DEADLY_SEED]
     assert report.errors[0].error == (
         "a worker process crashed twice: it ended with exit status 1; "
@@ -191,11 +191,11 @@ def test_the_episodes_of_a_crashed_group_are_played_last(monkeypatch: pytest.Mon
 
     def crash(worker: Any, item: Any) -> Any:
         if item[0][0] == SEEDS[0] and len(item[0]) > 1:
-            raise Crashed("gone")
+            raise WorkerCrash("gone")
         return attempt(worker, item)
 
     monkeypatch.setattr(_RolloutWorker, "attempt", crash)
-    evaluate(toy.make_environment, toy.make_agent, None, SEEDS, lanes=2, keep=lambda each: kept.append(each.seed))
+    evaluate(toy.make_environment, toy.make_agent, None, SEEDS, lanes=2, on_result=lambda each: kept.append(each.seed))
     assert kept == [*SEEDS[8:], *SEEDS[:8]]
 
 
@@ -261,7 +261,7 @@ def test_by_default_the_failures_and_ten_successes_are_kept() -> None:
         (3, failures[:3]),
         (0, []),
     ):
-        assert [result.seed - FIRST_SEED for result in chosen(report, wanted)] == seeds
+        assert [result.seed - FIRST_SEED for result in choose_results(report, wanted)] == seeds
 
 
 def test_a_recording_that_takes_another_course_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -288,7 +288,7 @@ def test_what_ends_differently_when_played_again_has_no_recording(
     assert merge_recordings(report, tmp_path, tmp_path / "rollouts.rrd", 2) == []
 
 
-@pytest.mark.parametrize("limit", ["MOST", "LARGEST"])
+@pytest.mark.parametrize("limit", ["MAX_RECORDINGS", "MAX_BYTES"])
 def test_what_would_be_too_large_in_one_file_stays_in_several(
     limit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -296,7 +296,7 @@ def test_what_would_be_too_large_in_one_file_stays_in_several(
     report = evaluate(toy.make_environment, toy.make_agent, toy.make_recorder(folder), SEEDS[:5])
     sizes = {file.name: file.stat().st_size for file in folder.iterdir()}
     two = sizes["failure-01000003-timeout.rrd"] + sizes["success-01000000.rrd"]
-    monkeypatch.setattr(recordings, limit, 2 if limit == "MOST" else two)
+    monkeypatch.setattr(recordings, limit, 2 if limit == "MAX_RECORDINGS" else two)
     with caplog.at_level("INFO", "vla.rollouts.recordings"):
         merged = merge_recordings(report, folder, target, "all")
     assert merged == [SEEDS[3], SEEDS[0]] and len(RrdReader(target).recordings()) == 2

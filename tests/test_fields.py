@@ -40,7 +40,7 @@ def of_all(store: EpisodeStore, field: str) -> list[np.ndarray]:
 
 def test_without_loss_batches_episodes_and_index_are_those_of_a_raw_store(tmp_path: Path) -> None:
     raw, small = add(tmp_path / "raw", EPISODES), add(tmp_path / "small", EPISODES, LOSSLESS)
-    assert small.tried == raw.tried and digest_of(small.episodes) == digest_of(raw.episodes)
+    assert small.attempts == raw.attempts and digest_of(small.episodes) == digest_of(raw.episodes)
     assert content(small.folder)["index.jsonl"] == content(raw.folder)["index.jsonl"]
     rows = np.random.default_rng(0).permutation(len(raw.rows("action")))
     nearest = [NearestDemonstration(store.folder, None, spec=ARM_SPEC) for store in (raw, small)]
@@ -68,15 +68,15 @@ def test_jpeg_is_close_and_smaller_and_depth_exact(tmp_path: Path) -> None:
 @pytest.mark.parametrize("codec", CODECS[1:], ids=str)
 def test_images_of_an_even_colour_come_back_small(codec: Codec) -> None:
     image = np.full((64, 48, 3), 77, np.uint8)
-    packed = encode(image, codec.of("rgb_front"), codec.quality)
+    packed = encode(image, codec.of_field("rgb_front"), codec.quality)
     assert len(packed) < image.nbytes / 5
-    np.testing.assert_array_equal(decode(packed, codec.of("rgb_front"), image.shape, image.dtype), image)
+    np.testing.assert_array_equal(decode(packed, codec.of_field("rgb_front"), image.shape, image.dtype), image)
     for wrong in (packed[:-4], packed[:9], b"", packed + packed):
         if wrong[: len(packed)] != packed or codec == LOSSLESS:  # what follows a JPEG is not read
             with pytest.raises(ValueError, match="the image cannot be decoded"):
-                decode(wrong, codec.of("rgb_front"), image.shape, image.dtype)
+                decode(wrong, codec.of_field("rgb_front"), image.shape, image.dtype)
     with pytest.raises(ValueError, match="the image"):
-        decode(packed, codec.of("rgb_front"), (64, 47, 3), image.dtype)
+        decode(packed, codec.of_field("rgb_front"), (64, 47, 3), image.dtype)
 
 
 @pytest.mark.parametrize(("size", "codec"), [((128, 128), RAW), ((128, 129), LOSSLESS)])
@@ -122,13 +122,13 @@ def test_a_store_keeps_its_codec_and_other_losses_are_refused(tmp_path: Path) ->
     ],
 )
 def test_the_config_names_the_codec(options: tuple[str, ...], codec: Codec | None) -> None:
-    assert Experiment.of(composed(*options)).collect.codec == codec
+    assert Experiment.from_config(composed(*options)).collect.codec == codec
 
 
 @pytest.mark.parametrize("codec", CODECS[1:], ids=str)
 def test_a_damaged_image_is_named_by_episode_and_step(tmp_path: Path, codec: Codec) -> None:
     store = add(tmp_path / "store", EPISODES, codec)
-    entry, row = store.tried[LATER], store.tried[LATER].start + 3
+    entry, row = store.attempts[LATER], store.attempts[LATER].start + 3
     begins = int(np.fromfile(store.folder / "rgb_wrist.ends", END)["end"][row - 1])
     change(store.folder / "rgb_wrist.pack", lambda data: data[:begins] + b"#" * 8 + data[begins + 8 :])
     says = r"rgb_wrist of step 3 of seed 1 in .*store was changed on disk: keep what is whole with job=inspect"
@@ -140,11 +140,13 @@ def test_a_damaged_image_is_named_by_episode_and_step(tmp_path: Path, codec: Cod
     ):
         with pytest.raises(ValueError, match=says):
             read()
-    assert store.read(store.tried[0]) and verify_store(store).damaged == {"rgb_wrist of step 3 changed or lost": [1]}
+    assert store.read(store.attempts[0]) and verify_store(store).damaged_seeds == {
+        "rgb_wrist of step 3 changed or lost": [1]
+    }
     assert derive_store([store], tmp_path / "repaired", repair=True) == [1]
     repaired = EpisodeStore(tmp_path / "repaired")
     assert repaired.codec == codec and [entry.seed for entry in repaired.episodes] == [0, 2, 4]
-    assert repaired.packed(repaired.tried[2]) == store.packed(store.tried[2])
+    assert repaired.packed_images(repaired.attempts[2]) == store.packed_images(store.attempts[2])
 
 
 def test_damaged_images_of_several_episodes_are_named_by_seed(tmp_path: Path) -> None:
@@ -155,7 +157,7 @@ def test_damaged_images_of_several_episodes_are_named_by_seed(tmp_path: Path) ->
     found = verify_store(store)
     with pytest.raises(ValueError, match=r"4 damaged .* \(4 seeds, 0, 1, 2, 4: rgb_wrist of step 0 changed or lost\)"):
         require_whole(found)
-    found.damaged.update({f"rgb_front of step {step} changed or lost": [step] for step in range(20)})
+    found.damaged_seeds.update({f"rgb_front of step {step} changed or lost": [step] for step in range(20)})
     with pytest.raises(ValueError, match=r"24 damaged .*: rgb_front of step 6 changed or lost; and 13 others\)"):
         require_whole(found)
 
@@ -168,7 +170,7 @@ def test_no_memory_is_taken_for_what_a_damaged_file_says(tmp_path: Path, end: in
     ends.tofile(tmp_path / "rgb_front.ends")
     for opened in (store, EpisodeStore(tmp_path)):
         with pytest.raises(ValueError, match=r"rgb_front of step [23] of seed 0 in .* was changed on disk"):
-            opened.read(store.tried[0])
+            opened.read(store.attempts[0])
 
 
 @pytest.mark.parametrize("file", ["rgb_wrist.pack", "rgb_wrist.ends"])
@@ -177,9 +179,9 @@ def test_a_truncated_file_is_named_and_what_is_before_it_is_kept(tmp_path: Path,
     change(tmp_path / file, lambda data: data[:-1])
     with pytest.raises(ValueError, match=r"rgb_wrist\.pack is shorter than its index says: keep what is whole"):
         EpisodeStore(store.folder)
-    assert verify_store(EpisodeStore(tmp_path, damaged=True)).damaged == {"rows changed or lost": [4]}
+    assert verify_store(EpisodeStore(tmp_path, allow_damage=True)).damaged_seeds == {"rows changed or lost": [4]}
     (tmp_path / file).unlink()
-    assert len(verify_store(EpisodeStore(tmp_path, damaged=True)).whole) == 0
+    assert len(verify_store(EpisodeStore(tmp_path, allow_damage=True)).intact_entries) == 0
 
 
 def test_jpeg_is_not_compressed_a_second_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,8 +195,8 @@ def test_jpeg_is_not_compressed_a_second_time(tmp_path: Path, monkeypatch: pytes
         require_whole(verify_store(copied))
         assert copied.codec == JPEG and [entry.seed for entry in copied.episodes] == seeds
         for entry in copied.episodes:
-            source = store.tried[entry.seed]
-            assert copied.packed(entry) == store.packed(source) and entry.crc == source.crc
+            source = store.attempts[entry.seed]
+            assert copied.packed_images(entry) == store.packed_images(source) and entry.crc == source.crc
 
 
 def test_stores_with_different_codecs_are_merged_without_a_further_loss(tmp_path: Path) -> None:
@@ -202,7 +204,7 @@ def test_stores_with_different_codecs_are_merged_without_a_further_loss(tmp_path
     derive_store(stores, tmp_path / "merged")
     merged = EpisodeStore(tmp_path / "merged")
     require_whole(verify_store(merged))
-    assert merged.codec == LOSSLESS and merged.derived  # no collection makes it
+    assert merged.codec == LOSSLESS and merged.is_derived  # no collection makes it
     expected = [images for store in stores for images in of_all(store, "rgb_front")]
     for images, others in zip(of_all(merged, "rgb_front"), expected, strict=True):
         np.testing.assert_array_equal(images, others)
@@ -230,11 +232,11 @@ def test_what_another_process_adds_does_not_disturb_a_reader(tmp_path: Path) -> 
 def test_a_pipe_in_place_of_images_and_ends_beyond_any_file_are_told(tmp_path: Path) -> None:
     store = add(tmp_path, EPISODES, LOSSLESS)
     far = np.fromfile(tmp_path / "rgb_wrist.ends", END)
-    far["end"][store.tried[LATER].start :][:2] = 2**63 - 10, 2**63 + 10
+    far["end"][store.attempts[LATER].start :][:2] = 2**63 - 10, 2**63 + 10
     change(tmp_path / "rgb_wrist.ends", lambda _: far.tobytes())
     for row in range(2):
         with pytest.raises(DamageError, match=f"rgb_wrist of step {row} of seed 1 "):
-            store.rows("rgb_wrist")[store.tried[LATER].start + row :][:1]
+            store.rows("rgb_wrist")[store.attempts[LATER].start + row :][:1]
     far["end"] = 0
     change(tmp_path / "rgb_wrist.ends", lambda _: far.tobytes())
     (tmp_path / "rgb_wrist.pack").unlink()
@@ -247,4 +249,4 @@ def test_an_episode_larger_than_the_memory_is_not_unpacked(tmp_path: Path, monke
     store = add(tmp_path, EPISODES, LOSSLESS)
     monkeypatch.setattr("vla.data.episodes.memory", lambda: 10**4)
     with pytest.raises(UserError, match=r"seed 0 in .* unpacks to 0 GB, and this machine has 0 GB of memory"):
-        store.read(store.tried[0])
+        store.read(store.attempts[0])

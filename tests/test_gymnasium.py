@@ -17,7 +17,7 @@ from saved_policies import save_policy
 from vla.config import packages
 from vla.config.adopt import adopt
 from vla.config.build import build
-from vla.config.experiment import plain
+from vla.config.experiment import to_plain
 from vla.spec import Environment
 from vla.tasks.gymnasium import Gymnasium
 
@@ -32,7 +32,7 @@ VALUES = (
 
 
 def node(**changes: Any) -> dict[str, Any]:
-    return {**plain(composed(*VALUES))["task"], **changes}
+    return {**to_plain(composed(*VALUES))["task"], **changes}
 
 
 def make(**changes: Any) -> Any:
@@ -153,7 +153,7 @@ def test_what_the_command_line_names_is_trusted_and_what_a_file_names_is_not(
         with pytest.raises(ValueError, match=rf"package cannot name {name!r}: give the name by which a package is"):
             packages.trust([], [], [name])
     packages.trust([], [])
-    file = save_policy(tmp_path / "policy", plain(composed(*VALUES)))
+    file = save_policy(tmp_path / "policy", to_plain(composed(*VALUES)))
     with pytest.raises(ValueError, match=r"policy names toy_gym, which is not trusted: add trust=\[toy_gym\]"):
         adopt(composed(f"checkpoint={file}"), [])
     with pytest.raises(ValueError, match="toy_gym, which is not trusted"):

@@ -47,7 +47,7 @@ def test_a_description_of_another_kind_is_refused_by_name(tmp_path: Path, change
     path = add(tmp_path, EPISODES[:1]).folder / "store.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     with pytest.raises(ValueError, match=r"store\.json.*: .*collect again") as caught:
-        EpisodeStore(tmp_path, damaged=True)
+        EpisodeStore(tmp_path, allow_damage=True)
     assert len(str(caught.value)) < 1000
 
 
@@ -80,11 +80,11 @@ def test_a_garbled_description_is_named_with_the_way_out(tmp_path: Path, content
 )
 def test_an_index_line_of_another_kind_is_refused_by_name(tmp_path: Path, change: dict[str, Any]) -> None:
     store = add(tmp_path, EPISODES[:2])
-    lines = [index_line(replace(store.tried[0], **change)), index_line(store.tried[1])]
+    lines = [index_line(replace(store.attempts[0], **change)), index_line(store.attempts[1])]
     (tmp_path / "index.jsonl").write_bytes(b"".join(lines))
     with pytest.raises(ValueError, match=r"line 1 of .*index\.jsonl is damaged.*job=inspect"):
         EpisodeStore(tmp_path)
-    assert EpisodeStore(tmp_path, damaged=True).tried[0].outcome == "lost"
+    assert EpisodeStore(tmp_path, allow_damage=True).attempts[0].outcome == "lost"
 
 
 def test_every_damaged_line_is_named(tmp_path: Path) -> None:
@@ -100,12 +100,12 @@ def test_every_damaged_line_is_named(tmp_path: Path) -> None:
         EpisodeStore(tmp_path)
     path.write_bytes(b"#\n#\n")
     with pytest.raises(ValueError, match=r"line 1 of .*so are the lines 2: copy the folder again"):
-        EpisodeStore(tmp_path, damaged=True)
-    path.write_bytes(lines[0] + index_line(replace(store.tried[1], seed=10**6)))
+        EpisodeStore(tmp_path, allow_damage=True)
+    path.write_bytes(lines[0] + index_line(replace(store.attempts[1], seed=10**6)))
     with pytest.raises(
         ValueError, match=r"index\.jsonl has too few lines for its seeds, 0 to 1000000: copy the folder again"
     ):
-        EpisodeStore(tmp_path, damaged=True)
+        EpisodeStore(tmp_path, allow_damage=True)
 
 
 def test_what_could_not_be_read_back_is_not_stored(tmp_path: Path) -> None:
@@ -113,7 +113,7 @@ def test_what_could_not_be_read_back_is_not_stored(tmp_path: Path) -> None:
     wordy = replace(EPISODES[0], instruction="a" * (LONGEST_INSTRUCTION + 1))
     with store.writing(), pytest.raises(ValueError, match=r"the entry of seed 0 .*instruction: .* at most 1000 char"):
         store.append(wordy)
-    assert EpisodeStore(tmp_path).tried == [] and not (tmp_path / "rgb_front.bin").read_bytes()
+    assert EpisodeStore(tmp_path).attempts == [] and not (tmp_path / "rgb_front.bin").read_bytes()
 
 
 def test_a_spec_comes_back_as_it_was() -> None:

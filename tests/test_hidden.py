@@ -9,11 +9,11 @@ from composing import composed
 from hostile import hidden, hiding, listener, save, ways
 from saved_policies import save_run
 
-from vla.config.experiment import plain
+from vla.config.experiment import to_plain
 from vla.models.checkpoint import read_header
 from vla.runs.resume import training_progress
 
-ATTACKS = list(hiding(plain(composed("expert=waypoint")), Path(), 0))
+ATTACKS = list(hiding(to_plain(composed("expert=waypoint")), Path(), 0))
 SECRET = "hunter2secret"
 HIDDEN = {"python": r"_target_ must name a class", "secret": "holds the reference"}  # what is said of it
 
@@ -24,7 +24,7 @@ def test_nothing_that_is_hidden_acts(attack: str, tmp_path: Path, monkeypatch: p
     monkeypatch.setenv("ATTACK_SECRET", SECRET)
     mark = tmp_path / "mark"
     with listener() as (port, connected):
-        config = hiding(plain(composed("expert=waypoint", "trainer.accelerator=cpu")), mark, port)[attack]
+        config = hiding(to_plain(composed("expert=waypoint", "trainer.accelerator=cpu")), mark, port)[attack]
         path = save(tmp_path / "theirs", config)
         small = ("output=mine", "cluster.workers=1", "evaluate.episodes=1", "recorder=none")
         for way, do in ways(path, *small).items():
@@ -36,10 +36,10 @@ def test_nothing_that_is_hidden_acts(attack: str, tmp_path: Path, monkeypatch: p
     assert not any(SECRET in file.read_bytes().decode("latin-1") for file in written)
 
 
-@pytest.mark.parametrize("attack", hidden(plain(composed()), Path()))
+@pytest.mark.parametrize("attack", hidden(to_plain(composed()), Path()))
 def test_what_a_mapping_of_a_checkpoint_hides_is_not_resumed(attack: str, tmp_path: Path) -> None:
     run = save_run(
-        tmp_path / "run", hidden(plain(composed(f"output={tmp_path}/run")), tmp_path / "mark")[attack], False
+        tmp_path / "run", hidden(to_plain(composed(f"output={tmp_path}/run")), tmp_path / "mark")[attack], False
     )
     with pytest.raises(ValueError, match=r"last\.ckpt (cannot be read as a checkpoint|holds )"):
         read_header(run / "checkpoints/last.ckpt")
@@ -47,7 +47,7 @@ def test_what_a_mapping_of_a_checkpoint_hides_is_not_resumed(attack: str, tmp_pa
 
 
 def test_the_policy_of_a_run_is_the_one_that_is_checked(tmp_path: Path) -> None:
-    config = plain(composed("expert=waypoint", f"output={tmp_path}"))
+    config = to_plain(composed("expert=waypoint", f"output={tmp_path}"))
     save_run(tmp_path, config)
     save(tmp_path / "policy", hiding(config, tmp_path / "mark", 0)["python in a number"])
     with pytest.raises(ValueError, match=r"differs in tokenizer\.bins"):

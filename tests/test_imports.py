@@ -158,7 +158,7 @@ from vla.config.compose import compose
 from vla.config.experiment import Experiment
 from vla.jobs import find
 robot = ["job=deploy", "deploy=server", "output=served", "checkpoint=without"]
-check(Experiment.of(adopt(compose(*robot), robot)), find("deploy"))
+check(Experiment.from_config(adopt(compose(*robot), robot)), find("deploy"))
 sys.argv[1:] += ["output=further", "collect.episodes=13"]
 main()
 """

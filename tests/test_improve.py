@@ -17,7 +17,7 @@ from composing import check, composed
 from reading import windows
 
 from vla.config.adopt import resume
-from vla.config.experiment import Experiment, plain
+from vla.config.experiment import Experiment, to_plain
 from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
@@ -28,7 +28,7 @@ from vla.models.policy_folder import read_policy
 from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import replay, rollout
-from vla.rollouts.supervised import Supervised, make_supervised, require_memoryless
+from vla.rollouts.supervised import SupervisedAgent, make_supervised, require_memoryless
 from vla.runs.folder import save_config
 from vla.tasks.perturb import Perturbed
 from vla.tasks.tabletop.expert import Waypoint
@@ -52,7 +52,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
 
 
 def test_the_policy_acts_and_the_expert_labels() -> None:
-    episode = rollout(toy.make_environment(), Supervised(toy.Wanderer(), toy.ToyExpert()), 7)
+    episode = rollout(toy.make_environment(), SupervisedAgent(toy.Wanderer(), toy.ToyExpert()), 7)
     alone = rollout(toy.make_environment(), toy.Wanderer(), 7)
     np.testing.assert_array_equal(episode.executed, alone.executed)
     assert not episode.success
@@ -128,7 +128,7 @@ def test_what_cannot_be_improved_is_refused_before_any_work(
     monkeypatch.setattr(Waypoint, "memoryless", wrong != "expert=clean")
     nowhere = (f"output={tmp_path}/run", f"collect.folder={tmp_path}/episodes")
     with pytest.raises(ValueError, match=sentence):
-        improve.run(Experiment.of(composed("job=improve", *nowhere, wrong)))
+        improve.run(Experiment.from_config(composed("job=improve", *nowhere, wrong)))
     assert not list(tmp_path.iterdir())
 
 
@@ -140,14 +140,14 @@ def test_the_episodes_of_a_round_may_have_another_task() -> None:
 
 def test_a_round_validates_once_at_its_end(tmp_path: Path) -> None:
     asked = composed("job=improve", "improve.steps=50", "trainer.accumulate_grad_batches=3")
-    trainer = improve._round(Experiment.of(asked), tmp_path / "policy", tmp_path, [])["trainer"]
+    trainer = improve._round(Experiment.from_config(asked), tmp_path / "policy", tmp_path, [])["trainer"]
     assert (trainer["max_steps"], trainer["val_check_interval"]) == (50, 150)  # steps, and batches
 
 
 def test_rounds_resume_with_their_own_config(tmp_path: Path) -> None:
     run = tmp_path / "run"
     saved = composed("job=improve", f"output={run}", "pretrained=policy", "improve.steps=7", "trainer.max_steps=9")
-    save_config(run, plain(saved), [])
+    save_config(run, to_plain(saved), [])
     more = ["job=improve", "improve.rounds=5"]
     resumed = resume(composed(f"output={tmp_path}/now", *more), run, more)
     assert (resumed.job, resumed.output, resumed.pretrained) == ("improve", str(run), "policy")
@@ -158,20 +158,20 @@ def test_the_folder_of_a_training_without_rounds_is_left_alone(tmp_path: Path) -
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints/last.ckpt").touch()
     with pytest.raises(ValueError, match=rf"{tmp_path} has a training without rounds: choose another output=DIR"):
-        improve.run(Experiment.of(composed(f"output={tmp_path}", "job=improve")))
+        improve.run(Experiment.from_config(composed(f"output={tmp_path}", "job=improve")))
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoints"]
 
 
 @pytest.mark.parametrize("change", ["seed=1", "trainer.max_steps=5", "+trainer.max_time={hours: 1}", "improve.steps=5"])
 def test_a_folder_with_other_rounds_or_longer_trainings_is_left_alone(tmp_path: Path, change: str) -> None:
     there = (f"output={tmp_path}", "job=improve")
-    save_config(tmp_path, plain(composed(*there)), [])
+    save_config(tmp_path, to_plain(composed(*there)), [])
     (tmp_path / "round_1/episodes").mkdir(parents=True)
     (tmp_path / "round_1/episodes/store.json").write_text("{}")
     before = (tmp_path / "config.yaml").read_bytes()
     key = "data.seed, seed" if change == "seed=1" else change.lstrip("+").partition("=")[0]
     with pytest.raises(ValueError, match=rf"{tmp_path} holds a training that differs in {key}"):
-        improve.run(Experiment.of(composed(*there, change)))
+        improve.run(Experiment.from_config(composed(*there, change)))
     assert (tmp_path / "config.yaml").read_bytes() == before
 
 
@@ -196,7 +196,7 @@ def test_rounds_that_were_killed_go_on_to_the_same_result(home: Path, monkeypatc
     here(home, "resume=rounds", "output=rounds", "job=improve", "improve.rounds=2")
     assert result(first) == whole
     labelled = EpisodeStore(second / "episodes")
-    assert [entry.seed for entry in labelled.tried] == [500002, 500003]
+    assert [entry.seed for entry in labelled.attempts] == [500002, 500003]
     assert labelled.codec == EpisodeStore(home / "few").codec == Codec("lossless")
     assert (home / "rounds/report_1.json").exists()  # of the policy after one round
     trained = read_policy(second).config
@@ -206,7 +206,7 @@ def test_rounds_that_were_killed_go_on_to_the_same_result(home: Path, monkeypatc
     monkeypatch.chdir(home)
     further = composed(*ROUNDS, *FEW, "output=further", "pretrained=rounds/round_2")
     with pytest.raises(ValueError, match=rf"collect\.more=\[{','.join(stores)}\] to train on these episodes again"):
-        improve.run(Experiment.of(further))
+        improve.run(Experiment.from_config(further))
     further.collect.more = stores
     with pytest.raises(ValueError, match=r"have 500000, 500001: set improve\.seed=500002, or higher"):
-        improve.run(Experiment.of(further))
+        improve.run(Experiment.from_config(further))

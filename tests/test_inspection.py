@@ -22,7 +22,7 @@ from vla.config.nodes import Inspection
 from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.header import Codec
-from vla.data.index import listed
+from vla.data.index import format_numbers
 from vla.data.verification import find_episode, require_whole, verify_store
 from vla.io.errors import UserError
 from vla.jobs.collect import demonstrations
@@ -81,30 +81,30 @@ def test_damage_is_found_named_and_left_behind(tmp_path: Path, name: str) -> Non
     folder, repaired = add(tmp_path / "store", EPISODES).folder, tmp_path / "repaired"
     damage(folder)
     before = content(folder)
-    found = verify_store(EpisodeStore(folder, damaged=True))
-    assert sorted(seed for some in found.damaged.values() for seed in some) == seeds
+    found = verify_store(EpisodeStore(folder, allow_damage=True))
+    assert sorted(seed for some in found.damaged_seeds.values() for seed in some) == seeds
     with pytest.raises(ValueError, match=rf"{len(seeds)} damaged episodes? .*{problem}.*inspect\.repair=true"):
         require_whole(found)
     if name == "no number":
         return
-    assert derive_store([EpisodeStore(folder, damaged=True)], repaired, repair=True) == seeds
+    assert derive_store([EpisodeStore(folder, allow_damage=True)], repaired, repair=True) == seeds
     assert content(folder) == before
     store, expected = EpisodeStore(repaired), add(tmp_path / "expected", EPISODES)
     outcomes = ["damaged" if episode.seed in seeds else episode.outcome for episode in EPISODES]
-    assert [entry.outcome for entry in store.tried] == outcomes
+    assert [entry.outcome for entry in store.attempts] == outcomes
     for entry in store.episodes:
-        rows = expected.read(expected.tried[entry.seed])
+        rows = expected.read(expected.attempts[entry.seed])
         assert all(np.array_equal(values, rows[field]) for field, values in store.read(entry).items())
 
 
 def test_collection_goes_on_in_a_repaired_store(tmp_path: Path) -> None:
     store = add(tmp_path / "store", EPISODES)
     change(store.folder / "action.bin", lambda data: flip(data, 0))
-    derive_store([EpisodeStore(store.folder, damaged=True)], tmp_path / "repaired", repair=True)
+    derive_store([EpisodeStore(store.folder, allow_damage=True)], tmp_path / "repaired", repair=True)
     repaired = EpisodeStore.create_or_open(tmp_path / "repaired", ARM_SPEC, CONFIG)
     summary = collect(repaired, make_arm, make_expert, episodes=4, cluster=Cluster(1, "beside"), seed=0)
-    assert (summary.tried, summary.failures) == (5, {"timeout": 1}) and summary.success_rate == 0.8
-    assert [(entry.seed, entry.outcome) for entry in repaired.tried][::5] == [(0, "damaged"), (5, "success")]
+    assert (summary.attempts, summary.failures) == (5, {"timeout": 1}) and summary.success_rate == 0.8
+    assert [(entry.seed, entry.outcome) for entry in repaired.attempts][::5] == [(0, "damaged"), (5, "success")]
 
 
 @pytest.mark.parametrize("codec", CODECS, ids=str)
@@ -112,14 +112,14 @@ def test_stores_of_one_config_become_what_one_collection_would_have_made(tmp_pat
     early, late = add(tmp_path / "early", MORE[:5], codec), add(tmp_path / "late", MORE[3:], codec)
     derive_store([late, early], tmp_path / "merged")
     assert content(tmp_path / "merged") == content(add(tmp_path / "whole", MORE, codec).folder)
-    assert not EpisodeStore.create_or_open(tmp_path / "merged", ARM_SPEC, CONFIG).derived
+    assert not EpisodeStore.create_or_open(tmp_path / "merged", ARM_SPEC, CONFIG).is_derived
 
 
 def test_copies_with_different_damage_make_a_whole_one(tmp_path: Path) -> None:
     for name, file in (("one", "action.bin"), ("two", "state.bin")):
         add(tmp_path / name, EPISODES)
         change(tmp_path / name / file, lambda data, at=0 if name == "one" else -1: flip(data, at % len(data)))
-    stores = [EpisodeStore(tmp_path / name, damaged=True) for name in ("one", "two")]
+    stores = [EpisodeStore(tmp_path / name, allow_damage=True) for name in ("one", "two")]
     assert derive_store(stores, tmp_path / "merged", repair=True) == []
     assert content(tmp_path / "merged") == content(add(tmp_path / "whole", EPISODES).folder)
 
@@ -142,7 +142,7 @@ def test_stores_of_several_configs_keep_them_apart(tmp_path: Path) -> None:
 def test_a_store_that_was_put_together_serves_training_and_does_not_grow(tmp_path: Path) -> None:
     derive_store([add(tmp_path / "store", EPISODES)], tmp_path / "chosen", {"seed": [1, 2]})
     chosen = EpisodeStore.create_or_open(tmp_path / "chosen", ARM_SPEC, {"task": {"size": 3.0}})
-    assert [entry.seed for entry in chosen.episodes] == [1, 2] and chosen.derived
+    assert [entry.seed for entry in chosen.episodes] == [1, 2] and chosen.is_derived
     assert len(chosen.statistics.actions) == len(EPISODES[1].actions) + len(EPISODES[2].actions)
     cluster = Cluster(1, "beside")
     assert collect(chosen, make_environment, make_expert, episodes=2, cluster=cluster, seed=0).added == 0
@@ -150,7 +150,7 @@ def test_a_store_that_was_put_together_serves_training_and_does_not_grow(tmp_pat
         collect(chosen, make_environment, make_expert, episodes=3, cluster=cluster, seed=0)
     change(chosen.folder / "index.jsonl", lambda data: data[: data.index(b"\n") + 1])
     with pytest.raises(ValueError, match="has lost lines: derive it again"):
-        verify_store(EpisodeStore(chosen.folder, damaged=True))
+        verify_store(EpisodeStore(chosen.folder, allow_damage=True))
 
 
 CHOICES: dict[str, tuple[dict[str, object], Callable[[Episode], bool]]] = {
@@ -172,7 +172,7 @@ def test_conditions_choose_episodes(tmp_path: Path, name: str) -> None:
     where, fits = CHOICES[name]
     derive_store([add(tmp_path / "store", episodes)], tmp_path / "chosen", where)
     store = EpisodeStore(tmp_path / "chosen")
-    assert [entry.seed for entry in store.tried] == [episode.seed for episode in MORE if fits(episode)]
+    assert [entry.seed for entry in store.attempts] == [episode.seed for episode in MORE if fits(episode)]
     assert store.config["where"] == [where]
     require_whole(verify_store(store))
 
@@ -203,7 +203,7 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path: Path) -> None:
         derive_store([store], tmp_path / "new")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "store"]
     shutil.copytree(store.folder, tmp_path / ".0123abcd.new")  # as if killed there
-    derive_store([EpisodeStore(store.folder, damaged=True)], tmp_path / "new", repair=True)
+    derive_store([EpisodeStore(store.folder, allow_damage=True)], tmp_path / "new", repair=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "other", "store"]
     (store.folder / "index.jsonl").unlink()
     with pytest.raises(ValueError, match=r"index\.jsonl is missing, which .* beside it needs: copy the folder again"):
@@ -220,7 +220,7 @@ def test_two_processes_do_not_write_one_new_store(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr("vla.data.derivation.track", meanwhile)
     derive_store([store], tmp_path / "inner/new")
-    assert verify_store(EpisodeStore(tmp_path / "inner/new")).whole == store.episodes
+    assert verify_store(EpisodeStore(tmp_path / "inner/new")).intact_entries == store.episodes
     assert [path.name for path in (tmp_path / "inner").iterdir()] == ["new"]
 
 
@@ -234,7 +234,7 @@ def test_a_seed_that_is_not_there_is_named(tmp_path: Path) -> None:
     change(tmp_path / "action.bin", lambda data: flip(data, 0))
     with pytest.raises(ValueError, match=r"the rows of seed 0 in .* were changed on disk"):
         find_episode(EpisodeStore(tmp_path), 0)
-    texts = [listed(seeds) for seeds in ([3], [4, 2, 3, 3], [1, 5], range(0, 40, 2))]
+    texts = [format_numbers(seeds) for seeds in ([3], [4, 2, 3, 3], [1, 5], range(0, 40, 2))]
     assert texts == ["3", "2 to 4", "1, 5", "0, 2, 4, 6, 8, 10, 12, 14 and 12 others"]
 
 
@@ -269,7 +269,7 @@ def test_a_store_that_was_put_together_is_of_a_task_as_any_other(
 ) -> None:
     def collected(name: str, *overrides: str) -> None:
         asked = ("job=collect", f"collect.folder={tmp_path / name}", *SMALL, "collect.episodes=1", *overrides)
-        demonstrations(Experiment.of(composed(*asked)))
+        demonstrations(Experiment.from_config(composed(*asked)))
 
     collected("all")
     inspect(tmp_path / "all", where={"seed": [0, 9]}, into=str(tmp_path / "chosen"))
@@ -292,10 +292,10 @@ def test_the_job_merges_and_refuses_what_contradicts_itself(tmp_path: Path) -> N
             inspect(tmp_path, **asked)
     for option in ("inspect.repair=true", "inspect.into=there"):
         with pytest.raises(ValueError, match=f"omit {option.partition('=')[0]}"):
-            run(Experiment.of(composed("job=inspect", "inspect.episode=7", option)))
+            run(Experiment.from_config(composed("job=inspect", "inspect.episode=7", option)))
     store = EpisodeStore.create_or_open(tmp_path / "store", ARM_SPEC, {})
     with store.writing():
         store.append(EPISODES[0])
     with pytest.raises(ValueError, match="does not contain the task of seed 0"):
         arguments = (f"inspect.folder={store.folder}", "inspect.episode=0", f"output={tmp_path}")
-        run(Experiment.of(composed("job=inspect", *arguments)))
+        run(Experiment.from_config(composed("job=inspect", *arguments)))

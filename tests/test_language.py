@@ -14,10 +14,10 @@ from hydra.utils import instantiate
 
 from vla.config.build import build
 from vla.config.compose import axes
-from vla.config.experiment import Experiment, plain
+from vla.config.experiment import Experiment, to_plain
 from vla.io.documents import read_yaml
 from vla.spec import FIRST_SEED
-from vla.tasks.tabletop.language import Grammar, HeldOut, Silence
+from vla.tasks.tabletop.language import Grammar, HeldOutKind, Silence
 from vla.tasks.tabletop.randomize.episode import paraphrase
 from vla.tasks.tabletop.scene import COLOURS, PADS
 
@@ -30,7 +30,7 @@ GRAMMAR = Grammar(
 )
 
 
-def instructions(held_out: HeldOut | None) -> set[str]:
+def instructions(held_out: HeldOutKind | None) -> set[str]:
     return {GRAMMAR.say({"block": "blue"}, held_out, np.random.RandomState(seed)) for seed in range(50)}
 
 
@@ -65,7 +65,7 @@ def test_other_words_replace_all_that_is_named_or_nothing_is_said() -> None:
 
 def test_a_word_that_the_goal_fills_is_refused() -> None:
     with pytest.raises(ValueError, match=r"task\.goal\.language has words for pad, slots that goals fill"):
-        build(plain(composed("task/goal=place", "+task.goal.language.words.pad=[pad,disc]").task), "task")
+        build(to_plain(composed("task/goal=place", "+task.goal.language.words.pad=[pad,disc]").task), "task")
 
 
 def heard() -> set[str]:
@@ -92,7 +92,9 @@ def test_no_word_that_names_something_unseen_is_in_any_training_instruction() ->
 
 
 def test_an_instruction_with_unseen_names_is_the_plain_one_with_other_names() -> None:
-    node = Experiment.of(composed("evaluate=unseen_names")).evaluate.changes["unseen_names"]["randomize"]["phrasing"]
+    node = Experiment.from_config(composed("evaluate=unseen_names")).evaluate.changes["unseen_names"]["randomize"][
+        "phrasing"
+    ]
     environment = make_tabletop("task/goal=mixed", "task/randomize=none")
     task = environment.simulation
     axes = {"plain": task.randomize, "renamed": {**task.randomize, "phrasing": instantiate(node)}}
@@ -213,7 +215,7 @@ def test_the_standard_benchmark_also_asks_for_nothing_and_for_what_cannot_be_don
 
 
 def test_what_cannot_be_done_is_said_as_the_goal_says_it() -> None:
-    grammar = GRAMMAR.renamed({"block": "absent"})
+    grammar = GRAMMAR.rename({"block": "absent"})
     assert grammar.phrasings == ("{put} the {absent} block there", "the {absent} block, please")
     assert grammar.held_out_phrasings == ("there goes the {absent} block",) and grammar.slots == {"absent"}
     assert (grammar.words, grammar.held_out_colours) == (GRAMMAR.words, GRAMMAR.held_out_colours)

@@ -40,7 +40,7 @@ from PIL import Image
 from toy import ARM, ARM_SPEC, make_arm
 
 from vla.config.experiment import make_agent
-from vla.data.datamodule import held_out
+from vla.data.datamodule import is_held_out
 from vla.data.episodes import EpisodeStore
 from vla.data.formats import lerobot_tables as tables
 from vla.data.formats.lerobot_dataset import LeRobotDataset
@@ -310,7 +310,7 @@ def test_every_step_has_the_instruction_of_its_task(home: Path, tmp_path: Path, 
             there[starts, 7:14] = 0
         np.testing.assert_allclose(here, there, rtol=1e-6)
     for fraction in np.linspace(0, 1, 11):  # what shows the same scene is on the same side
-        sides = [held_out(recording_of(entry), fraction) for entry in found.episodes]
+        sides = [is_held_out(recording_of(entry), fraction) for entry in found.episodes]
         assert sides[0] == sides[1] and sides[2] == sides[3]
 
 

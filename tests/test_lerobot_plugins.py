@@ -15,7 +15,7 @@ import pytest
 from composing import composed
 from toy import ARM_SPEC
 
-from vla.config.experiment import plain
+from vla.config.experiment import to_plain
 from vla.data.formats import lerobot_layout as layout
 from vla.envs import lerobot
 from vla.envs.lerobot import LeRobotEnvironment, arrays, observations
@@ -118,7 +118,7 @@ def test_the_commands_of_the_page_compose() -> None:
     options = PLUGINS["lerobot_policy_vla"] / "lerobot_policy_vla/conf"
     export, evaluate = re.findall(r"^python -m vla\.run (.*)$", page.replace("\\\n", ""), re.MULTILINE)
     assert composed(*shlex.split(export)).export.folder == "DATASET"
-    agent = plain(composed(*shlex.split(evaluate), f"hydra.searchpath=[file://{options}]"))["agent"]
+    agent = to_plain(composed(*shlex.split(evaluate), f"hydra.searchpath=[file://{options}]"))["agent"]
     target = agent.pop("_target_")
     module, _, name = target.rpartition(".")
     tree = ast.parse((PLUGINS["lerobot_policy_vla"] / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8"))

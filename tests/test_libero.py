@@ -19,7 +19,7 @@ from vla.config.experiment import Experiment
 from vla.io.errors import UserError
 from vla.jobs.evaluate import require_possible
 from vla.rollouts.rollout import rollout
-from vla.rollouts.supervised import Supervised
+from vla.rollouts.supervised import SupervisedAgent
 from vla.spec import FIRST_SEED, Array, Observation
 from vla.tasks.libero import package, scene
 from vla.tasks.libero.controller import Controller
@@ -46,7 +46,7 @@ def world(name: str = "", *overrides: str) -> Libero:
     """The world of a task such as "goal 3", of a suite, or of all."""
     suite, _, number = (name or "all").partition(" ")
     tasks = f"task.tasks=[{number}]" if number else "task.tasks=null"
-    made = Experiment.of(composed(*PLAIN, f"task.suite={suite}", tasks, *overrides)).make_environment()()
+    made = Experiment.from_config(composed(*PLAIN, f"task.suite={suite}", tasks, *overrides)).make_environment()()
     assert isinstance(made, Libero)
     return made
 
@@ -117,7 +117,7 @@ def test_demonstrations_never_start_where_policies_are_tested() -> None:
     starts = Starts(opened("spatial 4")[0], task_of("spatial 4"))
     official = np.array([starts.official(number).qpos for number in range(STATES)])
     assert len(np.unique(official, axis=0)) == STATES
-    drawn = np.array([starts.drawn(np.random.default_rng(seed), False).qpos for seed in range(20)])
+    drawn = np.array([starts.draw(np.random.default_rng(seed), False).qpos for seed in range(20)])
     assert np.abs(drawn[:, None] - official).max(axis=2).min() > 1e-3
     with closing(world("spatial 4")) as environment, environment.blind():
         environment.reset(0)
@@ -125,7 +125,7 @@ def test_demonstrations_never_start_where_policies_are_tested() -> None:
         for turn, official in ((0, 0), (7, 7), (50, 0), (FIRST_SEED, -1)):
             environment.reset(FIRST_SEED + turn)
             assert environment.draws["start"]["official"] == official
-    of_training = Experiment.of(composed("experiment=libero", *PLAIN, "task.suite=spatial", "task.tasks=[4]"))
+    of_training = Experiment.from_config(composed("experiment=libero", *PLAIN, "task.suite=spatial", "task.tasks=[4]"))
     validate = of_training.validate
     with closing(of_training.make_environment(validate.changes)()) as validation, validation.blind():
         validation.reset(validate.seed)
@@ -140,8 +140,8 @@ def test_things_exchange_places_but_those_that_the_task_tells_by_their_places(na
     placed: dict[bool, list[Array]] = {False: [], True: []}
     for exchanged, places in placed.items():
         for seed in range(20):
-            set_start(model, data, starts.drawn(np.random.default_rng(seed), exchanged))
-            assert not goal.reached(data)
+            set_start(model, data, starts.draw(np.random.default_rng(seed), exchanged))
+            assert not goal.is_reached(data)
             places.append(data.xpos.copy())
     usual, others = np.array(placed[False]), np.array(placed[True])
     far = np.linalg.norm(others - usual.mean(axis=0), axis=2).max(axis=0) > 0.1
@@ -184,7 +184,7 @@ def test_all_suites_have_ten_tasks_and_sentences() -> None:
 
 def test_no_official_state_counts_twice() -> None:
     def of_goal(*overrides: str) -> Experiment:
-        return Experiment.of(composed("experiment=libero", *PLAIN, "task.suite=goal", *overrides))
+        return Experiment.from_config(composed("experiment=libero", *PLAIN, "task.suite=goal", *overrides))
 
     with pytest.raises(UserError, match=r"evaluate\.episodes=2000: there are 500 different ones, .*episodes=500$"):
         require_possible(of_goal())
@@ -276,7 +276,7 @@ def test_no_millimetre_decides_whether_the_hand_goes_up_or_down() -> None:
         seen, at = environment.reset(1), Situation(environment._task)
         while not lines or at.opening > 0.5:  # until the fingers close
             at.take(truth_of(seen))
-            _, thing, where = at.goal.todo(at.data)[0]
+            _, thing, where = at.goal.unmet_predicates(at.data)[0]
             grasp, hand = choose_grasp(at, thing, place_of(at, thing, where, False)), at.hand.copy()
             assert grasp is not None
             for way in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)):
@@ -344,7 +344,7 @@ def test_the_planner_goes_on_from_where_another_agent_led() -> None:
 
     with closing(world("object 1")) as environment, environment.blind():
         planner, restless = (Planner(spec=environment.spec) for _ in range(2))
-        episode = rollout(environment, Supervised(Restless(restless), planner), 2, all_images=False)
+        episode = rollout(environment, SupervisedAgent(Restless(restless), planner), 2, all_images=False)
         assert episode.success
         led = (episode.executed != episode.actions).any(axis=1)
         assert 0.1 < led.mean() < 0.5
@@ -362,7 +362,7 @@ def test_the_truth_is_of_what_is_next() -> None:
         free = scene.model.jnt_qposadr[scene.model.body_jntadr[environment._goal.bodies[bowl]]]
         scene.data.qpos[free : free + 3] = scene.position(drawer)
         truth = truth_of(environment.step(np.zeros(7)))
-        assert environment._goal.todo(scene.data)[0].name == "close"
+        assert environment._goal.unmet_predicates(scene.data)[0].name == "close"
         assert np.array_equal(truth["object"], scene.position(drawer)) and np.array_equal(
             truth["goal"], truth["object"]
         )

@@ -115,7 +115,7 @@ def test_a_served_policy_is_judged_with_the_keys_of_openpi(caplog: pytest.LogCap
     with expert_behind_openpi(asked) as url, closing(world("object 0")) as environment:
         picture = environment.reset(FIRST_SEED).rgb["agentview"]
         config = composed(*ONE, "agent=remote_libero", f"agent.url={url}")
-        make = Experiment.of(config).make_agent()
+        make = Experiment.from_config(config).make_agent()
         policy = make(environment) if make else None
         assert isinstance(policy, RemotePolicy)
         with closing(policy):
@@ -166,7 +166,7 @@ def test_human_demonstrations_become_episodes_of_this_world(tmp_path: Path) -> N
     commands[:, 6] = np.sign(commands[:, 6])
     picture = Image.fromarray(np.tile(np.arange(256, dtype=np.uint8)[:, None], (256, 1, 3)))
     folder = published(tmp_path / "libero", commands, states, picture)
-    config = Experiment.of(composed(*PLAIN, "expert=lerobot_libero", f"expert.folder={folder}"))
+    config = Experiment.from_config(composed(*PLAIN, "expert=lerobot_libero", f"expert.folder={folder}"))
     with closing(world()) as environment:
         demonstrations = build(config["expert"], "expert", spec=environment.spec)
         store = EpisodeStore.create_or_open(tmp_path / "store", environment.spec.without_truth, {})
@@ -184,6 +184,6 @@ def test_human_demonstrations_become_episodes_of_this_world(tmp_path: Path) -> N
 def test_a_dataset_of_something_else_ends_in_a_sentence(tmp_path: Path) -> None:
     folder = published(tmp_path / "libero", np.zeros((6, 7)), np.zeros((6, 7)), Image.new("RGB", (256, 256)))
     info(lambda content: content["features"]["observation.state"].update(shape=[7], names=None))(folder)
-    config = Experiment.of(composed(*PLAIN, "expert=lerobot_libero", f"expert.folder={folder}"))
+    config = Experiment.from_config(composed(*PLAIN, "expert=lerobot_libero", f"expert.folder={folder}"))
     with closing(world()) as environment, pytest.raises(UserError, match=r"state has 7 numbers .* that of the task 8"):
         build(config["expert"], "expert", spec=environment.spec)

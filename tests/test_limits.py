@@ -45,7 +45,7 @@ def test_the_tightest_of_nested_groups_counts(root: Path) -> None:
     (root / "job" / "memory.stat").write_text("anon 60\ninactive_file 10\n")
     assert limits.memory() == 80
     assert limits.free_memory() == 20  # 60 of 80 are in use; the kernel drops files that nobody reads
-    assert limits.scarce_memory(0.26) and not limits.scarce_memory(0.25)
+    assert limits.is_memory_scarce(0.26) and not limits.is_memory_scarce(0.25)
 
 
 def test_a_small_group_on_a_full_machine_has_what_the_smaller_of_both_leaves(

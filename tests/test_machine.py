@@ -8,7 +8,7 @@ import pytest
 from composing import composed
 
 from vla import jobs
-from vla.config.experiment import Experiment, plain
+from vla.config.experiment import Experiment, to_plain
 from vla.jobs.machine import has_bfloat16, require_compiler, warn_of_bfloat16
 
 FP32 = {"trainer": {"precision": "fp32", "accelerator": "cpu"}, "policy": {"precision": "fp32", "device": "cpu"}}
@@ -39,11 +39,11 @@ def test_a_job_that_compiles_is_refused_without_a_compiler(monkeypatch: pytest.M
         key = compiling[1].removesuffix("=true")
         message = rf"^{key} needs a C\+\+ compiler, and there is no no-such-compiler: .*, or set {key}=false$"
         with pytest.raises(ValueError, match=message):
-            jobs.run(Experiment.of(composed(*compiling, "trainer.accelerator=cpu", "policy.device=cpu")))
+            jobs.run(Experiment.from_config(composed(*compiling, "trainer.accelerator=cpu", "policy.device=cpu")))
     assert not [*tmp_path.iterdir()]
     others = ("job=train", "policy.compile=true"), ("job=evaluate", "agent=expert", "policy.compile=true")
     for compiles_nothing in (*others, ("job=collect", "learner.compile=true")):
-        config = plain(composed(*compiles_nothing))
+        config = to_plain(composed(*compiles_nothing))
         require_compiler(config, jobs.find(config["job"]).needs(config))
     (tmp_path / "g++").touch(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))

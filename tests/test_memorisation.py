@@ -13,7 +13,7 @@ from toy_recordable import RecordableEnvironment
 
 from vla.data.episodes import EpisodeStore
 from vla.rollouts.evaluate import evaluate
-from vla.rollouts.memorisation import NearestDemonstration, WithoutModality, open_memory
+from vla.rollouts.memorisation import AgentWithoutModality, NearestDemonstration, open_memory
 from vla.rollouts.rollout import rollout
 from vla.spec import FIRST_SEED, Array, Observation
 
@@ -33,16 +33,16 @@ class Noting(toy.ToyExpert):
 
 def test_without_images_all_is_grey_and_without_an_instruction_nothing_is_said() -> None:
     environment, agent = RecordableEnvironment(), Noting()
-    seen = rollout(environment, WithoutModality(agent, "images"), FIRST_SEED).observations[0]
+    seen = rollout(environment, AgentWithoutModality(agent, "images"), FIRST_SEED).observations[0]
     for blind in agent.seen:
         assert all((image == 128).all() for image in blind.rgb.values())
         assert not any(image.any() for image in blind.depth.values())
     assert agent.seen[0].rgb.keys() == seen.rgb.keys() and agent.seen[0].instruction == agent.heard == seen.instruction
     assert np.array_equal(agent.seen[0].state, seen.state)
-    rollout(environment, WithoutModality(agent, "instruction"), FIRST_SEED)
+    rollout(environment, AgentWithoutModality(agent, "instruction"), FIRST_SEED)
     assert agent.heard == agent.seen[0].instruction == ""
     assert np.array_equal(agent.seen[0].rgb["front"], seen.rgb["front"])
-    rollout(environment, WithoutModality(agent, "both"), FIRST_SEED)
+    rollout(environment, AgentWithoutModality(agent, "both"), FIRST_SEED)
     assert agent.heard == agent.seen[0].instruction == "" and (agent.seen[0].rgb["front"] == 128).all()
     assert np.array_equal(agent.seen[0].state, seen.state)
 

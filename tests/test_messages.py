@@ -107,7 +107,7 @@ def test_joints_are_found_by_name() -> None:
     """Without a velocity they are at rest, and further joints do not matter."""
     states = messages.JointStates(ROBOT)
     found = states.read(joints(), 7.0) or pytest.fail("it has the arm")
-    assert (found.at, found.opening) == (7.0, pytest.approx(0.04))
+    assert (found.stamp, found.opening) == (7.0, pytest.approx(0.04))
     assert (found.joints.tolist(), found.velocities.tolist()) == ([1.0, 2.0], [0.1, 0.2])
     for unknown in ([], [float("nan")] * 5):
         assert states.read(joints(velocity=unknown), 0.0).velocities.tolist() == [0.0, 0.0]  # type: ignore[union-attr]

@@ -26,7 +26,7 @@ from saved_policies import save_policy
 from websockets.sync.client import connect
 
 from vla.api import load_policy
-from vla.config.experiment import Experiment, plain
+from vla.config.experiment import Experiment, to_plain
 from vla.data.episodes import EpisodeStore
 from vla.deploy.client_observation import Keys
 from vla.deploy.server import PolicyServer, Service
@@ -43,7 +43,7 @@ LEROBOT = (0.75, 0.075, 0.7)  # where it puts the camera corner2 [m]
 
 
 def experiment(*overrides: str) -> Experiment:
-    return Experiment.of(composed("task=metaworld", *overrides))
+    return Experiment.from_config(composed("task=metaworld", *overrides))
 
 
 def world(*overrides: str) -> MetaWorld:
@@ -221,7 +221,10 @@ def test_images_that_are_parts_of_a_picture_are_not_taken_from_whole_ones() -> N
     ).spec
     assert spec.cut == ("corner2", "hand") and world("task.cameras=[corner2]").spec.cut == ()
     whole_beside_hand = world("task.cameras=[corner2,hand]").spec
-    assert whole_beside_hand.given(["picture"]) == ["picture"] and whole_beside_hand.size("picture") == (480, 480)
+    assert whole_beside_hand.required_images(["picture"]) == ["picture"] and whole_beside_hand.size("picture") == (
+        480,
+        480,
+    )
     keys = Keys({"corner2": "image", "hand": "hand", "topview": "top"}, ["state"], "prompt")
     whole, part = np.zeros((480, 480, 3), np.uint8), np.zeros((96, 96, 3), np.uint8)
     sent = {"image": part, "hand": part, "top": whole, "state": np.zeros(4), "prompt": "Reach a goal position"}
@@ -253,7 +256,7 @@ def parts() -> Parts:
 def test_anybody_who_has_lerobots_picture_and_the_state_gives_the_images_of_the_policy(parts: Parts) -> None:
     spec, seen = parts
     keys = Keys({"picture": "image"}, ["state"], "prompt")
-    assert spec.given(keys.images) == ["picture"] and world().spec.given(keys.images) == ["corner2"]
+    assert spec.required_images(keys.images) == ["picture"] and world().spec.required_images(keys.images) == ["corner2"]
     for whole, own in seen:
         sent = {"image": whole.rgb["corner2"], "state": whole.state, "prompt": whole.instruction}
         shown = spec.images(keys.observation(sent, spec))
@@ -365,15 +368,15 @@ def test_a_client_plays_a_served_policy_on_lerobots_picture_and_is_compared(
 ) -> None:
     small = ("model.width=16", "model.keypoints=4", "model.text_width=8", "task.tasks=[reach]", "task.steps=5")
     config = composed("experiment=metaworld", *small)
-    asked = Experiment.of(config)
+    asked = Experiment.from_config(config)
     spec = asked.world().spec
-    run = save_policy(tmp_path / "run", plain(config), spec, state=asked.learner(spec).model.state_dict())
+    run = save_policy(tmp_path / "run", to_plain(config), spec, state=asked.learner(spec).model.state_dict())
     policy, folder = load_policy(run, device="cpu"), str(tmp_path / "played")
     keys = Keys({"picture": "observation/image"}, ["observation/state"], "prompt")
     made: dict[str, Any] = {"policy": lambda: policy, "environment": asked.make_environment(), "output": tmp_path}
     server = PolicyServer(**defaults_of("deploy/server", port=0, keys=keys, api_key=None), **made)
     monkeypatch.setattr(metaworld_client, "STEPS", 5)
-    with Service(server, policy).in_thread() as url:
+    with Service(server, policy).serve_in_thread() as url:
         with connect(url, compression=None, max_size=None) as socket:
             assert metaworld_client.Server(socket).about["images"] == {"observation/image": [480, 480, 3]}
         metaworld_client.main("1000000", "1", folder, "reach", url)

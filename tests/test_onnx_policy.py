@@ -101,7 +101,7 @@ def test_programs_are_exported_once_for_the_same_weights_and_options(
 
 def test_a_checkpoint_acts_through_its_programs(home: Path, tmp_path: Path) -> None:
     asked = composed(f"checkpoint={home}/run", "policy=onnx", f"policy.folder={tmp_path}")
-    onnx: Any = Experiment.of(asked).make_policy()()
+    onnx: Any = Experiment.from_config(asked).make_policy()()
     assert onnx.act(onnx.spec.random_observation(np.random.default_rng(0))).shape == (len(onnx.spec.action),)
     assert onnx.lanes == 1  # a server plans for one client at a time
 

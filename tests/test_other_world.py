@@ -43,7 +43,7 @@ OWN = {"expert": "clean", "evaluate": "generalisation"}
 
 def policy_of(store: Path, environment: Any = None, overrides: tuple[str, ...] = SMALL) -> Policy:
     """A policy after two steps of training."""
-    experiment, opened = Experiment.of(composed(*overrides)), EpisodeStore(store)
+    experiment, opened = Experiment.from_config(composed(*overrides)), EpisodeStore(store)
     learner = experiment.fitted_learner(opened)
     network = learner.model
     data = experiment.data(opened, network.history, network.chunk, network)

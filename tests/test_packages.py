@@ -31,7 +31,7 @@ from vla.config.adopt import adopt, finetune, resume
 from vla.config.annotations import locate
 from vla.config.build import build
 from vla.config.compose import compose_task
-from vla.config.experiment import plain
+from vla.config.experiment import to_plain
 
 EXAMPLE = Path(__file__).parent / "example_package"
 ROOT = Path(__file__).parents[1]
@@ -225,7 +225,7 @@ def test_a_policy_that_predicts_no_tokens_is_loaded_by_programs(home: Path, impo
 
 
 def test_a_checkpoint_never_trusts_itself(importable: None, tmp_path: Path) -> None:
-    config = plain(composed()) | {"trust": ["mypackage"]}
+    config = to_plain(composed()) | {"trust": ["mypackage"]}
     config["task"] = config["data"] = {"_target_": "vla.spec.Environment"}  # which is cheap to import
     config["model"] = {"_target_": MODEL, "width": 8, "text": config["model"]["text"]}
     path = save_run(tmp_path / "runs/theirs", config)
@@ -244,7 +244,7 @@ def test_a_checkpoint_never_trusts_itself(importable: None, tmp_path: Path) -> N
             way()
     packages.trust(["mypackage"], [])
     for way in ways:
-        assert plain(way())["trust"] == []
+        assert to_plain(way())["trust"] == []
 
 
 def test_programs_find_its_options(importable: None) -> None:
@@ -253,7 +253,7 @@ def test_programs_find_its_options(importable: None) -> None:
 
 def test_a_choice_trusts_one_class(importable: None) -> None:
     packages.trust([], [MODEL, "other.models.Mine"])
-    assert packages.trusted() == [MODEL]
+    assert packages.trusted_names() == [MODEL]
     assert locate("model._target_", MODEL).__name__ == "Mine"
     for target in ("mypackage.tokenizers.Few", "mypackage.world.Square", "other.models.Mine"):
         with pytest.raises(ValueError, match=rf"^node names {re.escape(target)}, which is not trusted: add trust="):
@@ -263,7 +263,7 @@ def test_a_choice_trusts_one_class(importable: None) -> None:
 def test_a_package_is_trusted_by_its_whole_name(importable: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(packages.TRUST, "another, mypackage")
     packages.trust([], [])
-    assert packages.trusted() == ["another", "mypackage"]
+    assert packages.trusted_names() == ["another", "mypackage"]
     assert locate("node", MODEL).__name__ == "Mine"
     with pytest.raises(ValueError, match=r"mypackage_evil\.Model, which is not trusted: add trust=\[mypackage_evil\]"):
         locate("node", "mypackage_evil.Model")

@@ -22,7 +22,7 @@ from tiny_encoder import sizes, write_encoder
 
 from vla import jobs
 from vla.config.adopt import finetune
-from vla.config.experiment import Experiment, make_policy, plain
+from vla.config.experiment import Experiment, make_policy, to_plain
 from vla.io.errors import UserError
 from vla.models.policy_folder import read_policy
 from vla.policy import Policy
@@ -38,7 +38,7 @@ SMALL = ("task.image_size=[32,32]", "trainer.accelerator=cpu", "recorder=none")
 
 def trained(tmp_path: Path, tabletop: Tabletop, *overrides: str) -> tuple[Policy, Path]:
     """A policy after two steps on noise, and the checkpoint of it."""
-    learner = Experiment.of(composed(*SMALL, *overrides)).learner(tabletop.spec)
+    learner = Experiment.from_config(composed(*SMALL, *overrides)).learner(tabletop.spec)
     trainer = make_trainer(2, EMA(0.9))
     batch = make_batch(learner.model.history, learner.model.chunk, spec=tabletop.spec)
     trainer.fit(learner, loader(learner, [batch] * 2))
@@ -66,7 +66,7 @@ def test_a_policy_names_the_encoder_of_its_instructions(tmp_path: Path, tabletop
 
 
 def test_a_training_from_weights_has_its_own_order_of_windows(tmp_path: Path) -> None:
-    start = save_policy(tmp_path, plain(composed(*SMALL)))
+    start = save_policy(tmp_path, to_plain(composed(*SMALL)))
     config = finetune(composed(*SMALL, f"pretrained={start}", "seed=3"), ["seed=3"])
     assert config.data.seed == 3
 
@@ -74,7 +74,7 @@ def test_a_training_from_weights_has_its_own_order_of_windows(tmp_path: Path) ->
 def test_rounds_continue_the_training_of_their_policy(tmp_path: Path) -> None:
     own = ("task/goal=push", "expert=clean", "learner.weight_decay=0.3", "collect.episodes=60")
     before = composed(*SMALL, *own)
-    start = f"pretrained={save_policy(tmp_path, plain(before))}"
+    start = f"pretrained={save_policy(tmp_path, to_plain(before))}"
     rounds = finetune(composed("job=improve", start), [])
     assert (rounds.task, rounds.expert, rounds.learner) == (before.task, before.expert, before.learner)
     assert rounds.collect == before.collect  # the folder too: the same demonstrations are used again
@@ -95,7 +95,7 @@ def test_a_policy_finds_the_encoder_of_its_instructions_in_a_package(
     policy, checkpoint = trained(tmp_path, tabletop, "model/text=minilm", *values)
     action = policy.act(tabletop.reset(0))
     assert np.array_equal(make_policy(CPU, checkpoint, tabletop).act(tabletop.reset(0)), action)
-    learner = Experiment.of(finetune(composed(*SMALL, f"pretrained={checkpoint}"), [])).learner(
+    learner = Experiment.from_config(finetune(composed(*SMALL, f"pretrained={checkpoint}"), [])).learner(
         tabletop.spec, checkpoint
     )
     assert np.array_equal(as_policy(learner.model, tabletop.spec, device="cpu").act(tabletop.reset(0)), action)
@@ -128,7 +128,7 @@ def test_what_cannot_be_built_is_named_before_anything_is_collected(tmp_path: Pa
     there = (f"collect.folder={tmp_path}/store", f"output={tmp_path}/run", "job=train")
     asked = composed(*SMALL, *there, "model/image=timm", "model.image.name=vit_smal_patch16_dinov3")
     with pytest.raises(ValueError, match="did you mean vit_small_patch16_dinov3"):
-        jobs.run(Experiment.of(asked))
+        jobs.run(Experiment.from_config(asked))
     assert not (tmp_path / "store").exists()
 
 
@@ -149,7 +149,7 @@ def test_training_starts_from_a_policy_whose_demonstrations_held_another_truth(
     assert tabletop.spec.robot is not None
     robot = replace(tabletop.spec.robot, chain=())
     without = replace(tabletop.spec, truth=(), robot=robot)  # as recordings of a real robot are
-    model = Experiment.of(composed(*SMALL)).learner(without, checkpoint).model
+    model = Experiment.from_config(composed(*SMALL)).learner(without, checkpoint).model
     own, saved = model.state_dict(), read_policy(checkpoint).state
     assert {name for name in saved if name not in own} == {name for name in saved if name.startswith("truth_")} != set()
     assert all(torch.equal(saved[name], value) for name, value in own.items())

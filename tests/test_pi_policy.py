@@ -33,8 +33,8 @@ from torch import Tensor
 from vla.config.compose import compose
 from vla.io.errors import UserError
 from vla.models.tokenizers.tokenizer import Uniform
-from vla.models.vlm.network import renamed
-from vla.models.vlm.policy import VisionLanguageAction, last_of
+from vla.models.vlm.network import rename_weight
+from vla.models.vlm.policy import VisionLanguageAction, last_values
 from vla.models.vlm.prompt import PADDING, WORDS, Prompt
 from vla.models.vlm.smolvla import SmolVLA
 
@@ -71,8 +71,8 @@ def test_names_and_shapes_are_those_that_are_published(name: str) -> None:
     with torch.device("meta"):
         network = {**KINDS, "smolvla": SmolVLA}[name](**arguments)
     ours = {weight: [*tensor.shape] for weight, tensor in network.named_parameters()}
-    used = {weight: shape for weight, shape in shapes.items() if not weight.startswith(network.unused)}
-    assert {renamed(weight, network.published): shape for weight, shape in used.items()} == ours
+    used = {weight: shape for weight, shape in shapes.items() if not weight.startswith(network.unused_names)}
+    assert {rename_weight(weight, network.published_names): shape for weight, shape in used.items()} == ours
     assert len(used) == len(ours)  # no two are one
     head = "model.vlm_with_expert.vlm" if name == "smolvla" else "paligemma_with_expert.gemma_expert"
     assert shapes.keys() - used.keys() == {f"{head}.lm_head.weight"}
@@ -131,7 +131,7 @@ def test_published_weights_and_statistics_are_loaded_and_a_missing_weight_is_nam
     lost = next(weight for weight in saved if "lm_head" not in weight)
     save_file({weight: tensor for weight, tensor in saved.items() if weight != lost}, tmp_path / "model.safetensors")
     with pytest.raises(
-        UserError, match=f"lacks weights of the model: {re.escape(renamed(lost, model.network.published))}$"
+        UserError, match=f"lacks weights of the model: {re.escape(rename_weight(lost, model.network.published_names))}$"
     ):
         make_policy(name, text, trunk=str(tmp_path))
 
@@ -168,8 +168,8 @@ def test_what_actions_see_of_a_prompt_does_not_end_with_its_padding(tmp_path: Pa
     model = make_policy("pi05", write_tokenizer(tmp_path))
     take_statistics(model)
     with torch.no_grad():
-        together = model.known(batch_of(model))
+        together = model.encode_prefix(batch_of(model))
     lengths = together.present.sum(1)
     assert lengths[0] != lengths[1]
-    for number, seen in enumerate(last_of(together)):
+    for number, seen in enumerate(last_values(together)):
         assert torch.equal(seen, together.values[-1][number, :, lengths[number] - 1].flatten())

@@ -14,7 +14,14 @@ from rich import get_console
 from scipy.stats import binom, multinomial
 
 from vla.rollouts.comparison import fisher, mcnemar
-from vla.rollouts.planning import MOST, episodes_needed, power_for_bar, power_of_pairs, power_of_samples, stopping
+from vla.rollouts.planning import (
+    MAX_EPISODES,
+    episodes_needed,
+    power_for_bar,
+    power_of_pairs,
+    power_of_samples,
+    stopping,
+)
 from vla.rollouts.sequential import excludes
 from vla.rollouts.statistics import wilson_interval
 
@@ -59,7 +66,7 @@ def test_the_number_is_where_the_power_is_reached() -> None:
     assert 781 < needed < 1.1 * 781
     assert episodes_needed(lambda episodes: 0.5, 0.8) is None
     assert episodes_needed(lambda episodes: float(episodes >= 150_000), 0.8) == 150_000
-    assert episodes_needed(lambda episodes: float(episodes > MOST), 0.8) is None
+    assert episodes_needed(lambda episodes: float(episodes > MAX_EPISODES), 0.8) is None
 
 
 def test_stopping_rarely_errs_and_is_early_where_the_difference_is_large() -> None:
@@ -68,8 +75,8 @@ def test_stopping_rarely_errs_and_is_early_where_the_difference_is_large() -> No
         assert fixed is not None
         stops, early = stopping(0.5, won, lost, 0.8, fixed), stopping(0.5, larger, lost, 0.8, fixed)
         assert stops is not None and early is not None
-        assert stops.mean < 1.1 * fixed < stops.most < 2.5 * fixed and early.mean < 0.5 * fixed
-        assert 0.005 < stops.wrong < 0.05
+        assert stops.mean < 1.1 * fixed < stops.max_episodes < 2.5 * fixed and early.mean < 0.5 * fixed
+        assert 0.005 < stops.type_1_error < 0.05
     assert stopping(0.5, 0.11, 0.1, 0.99, 10) is None
 
 
@@ -79,12 +86,12 @@ def test_stopping_is_as_late_as_in_simulated_evaluations() -> None:
     assert stops is not None
     ended = []
     for _ in range(300):
-        drawn = random.random(stops.most)
+        drawn = random.random(stops.max_episodes)
         counts = np.cumsum(drawn < won), np.cumsum(drawn > 1 - lost)
         decided = [n for n, (ones, zeros) in enumerate(zip(*counts, strict=True), 1) if excludes(0.5, ones, zeros)]
         ended.append(decided[0] if decided else np.inf)
     assert np.mean(np.isfinite(ended)) == pytest.approx(0.8, abs=0.08)
-    assert np.minimum(ended, stops.most).mean() == pytest.approx(stops.mean, rel=0.08)
+    assert np.minimum(ended, stops.max_episodes).mean() == pytest.approx(stops.mean, rel=0.08)
 
 
 def test_the_command_prints_a_row_per_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from command_line import here
 
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.results import Result
-from vla.runs.played import PLAYED, Played
+from vla.runs.played import RESULTS_FILE, PlayedEpisodes
 from vla.spec import FIRST_SEED, Array, Observation
 from vla.tasks.perturb import Perturbed
 
@@ -43,7 +43,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("whole")
     done = here(folder, *COMMAND, "output=run")
     assert "as configured (1 of 2)" in done.stdout and "short (2 of 2)" in done.stdout
-    assert not (folder / "run" / PLAYED).exists()
+    assert not (folder / "run" / RESULTS_FILE).exists()
     return reported(folder / "run")
 
 
@@ -59,12 +59,12 @@ def test_a_report_without_room_costs_no_episode_and_no_recording(
     assert f"/{EPISODES} (" in failed.stdout and not (tmp_path / "run/report.json").exists()
     done = here(tmp_path, *asked)
     assert f"episodes already played: {2 * EPISODES}, in" in done.stdout + done.stderr
-    assert not (tmp_path / "run" / PLAYED).exists()
+    assert not (tmp_path / "run" / RESULTS_FILE).exists()
     assert len(reported(tmp_path / "run")["recorded"]) == EPISODES
 
 
 def test_two_processes_do_not_evaluate_in_one_folder(tmp_path: Path) -> None:
-    with Played(tmp_path / "run", {}):
+    with PlayedEpisodes(tmp_path / "run", {}):
         refused = here(tmp_path, *COMMAND, "output=run", ok=False)
     assert "another process evaluates in" in refused.stderr and "choose another output=DIR" in refused.stderr
 
@@ -90,14 +90,14 @@ def test_only_episodes_that_ended_in_an_error_are_played_again(tmp_path: Path, w
 def test_an_interrupted_evaluation_says_which_command_goes_on(tmp_path: Path, whole: dict[str, Any]) -> None:
     def interrupted(*arguments: str) -> str:
         """What it says after each episode that it adds."""
-        add = Played.add
+        add = PlayedEpisodes.add
 
-        def add_one(self: Played, condition: str, result: Result) -> None:
+        def add_one(self: PlayedEpisodes, condition: str, result: Result) -> None:
             add(self, condition, result)
             raise KeyboardInterrupt
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Played, "add", add_one)
+            patch.setattr(PlayedEpisodes, "add", add_one)
             done = here(tmp_path, *COMMAND, *arguments, ok=False)
         assert done.returncode == 130 and not done.stderr
         return done.stdout
@@ -114,7 +114,7 @@ def test_an_interrupted_evaluation_says_which_command_goes_on(tmp_path: Path, wh
 
 def play(folder: Path, head: dict[str, str], *seeds: int) -> dict[int, Result]:
     """What an evaluation finds that plays some seeds and is interrupted."""
-    with suppress(KeyboardInterrupt), Played(folder, head) as played:
+    with suppress(KeyboardInterrupt), PlayedEpisodes(folder, head) as played:
         found = dict(played.results["seen"])
         for seed in seeds:
             played.add("seen", Result(seed, "success"))
@@ -123,9 +123,9 @@ def play(folder: Path, head: dict[str, str], *seeds: int) -> dict[int, Result]:
 
 
 def test_what_was_played_is_used_until_weights_or_versions_change(tmp_path: Path) -> None:
-    assert not play(tmp_path, {"weights": "1"}) and not (tmp_path / PLAYED).exists()
+    assert not play(tmp_path, {"weights": "1"}) and not (tmp_path / RESULTS_FILE).exists()
     assert not play(tmp_path, {"weights": "1"}, *SEEDS)
-    file = tmp_path / PLAYED
+    file = tmp_path / RESULTS_FILE
     file.write_bytes(file.read_bytes()[:-20])  # the line that a killed process left unfinished
     assert [*play(tmp_path, {"weights": "1"}, SEEDS[-1])] == [*SEEDS[:-1]]
     assert {*play(tmp_path, {"weights": "1"})} == {*SEEDS}
@@ -136,8 +136,8 @@ def test_known_episodes_are_not_played_again() -> None:
     makers = toy.make_environment, toy.make_agent, None
     expected, kept = evaluate(*makers, SEEDS).results, list[Result]()
     some, every = ({result.seed: result for result in found} for found in (expected[::2], expected))
-    assert evaluate(*makers, SEEDS, known=some, keep=kept.append).results == expected
+    assert evaluate(*makers, SEEDS, known_results=some, on_result=kept.append).results == expected
     assert {result.seed for result in kept} == {*SEEDS} - {*some}
     more, until = range(FIRST_SEED, FIRST_SEED + 99), lambda report: report.episodes == 2
-    assert evaluate(*makers, more, until=until, known=every, keep=kept.append).results == expected[:2]
+    assert evaluate(*makers, more, until=until, known_results=every, on_result=kept.append).results == expected[:2]
     assert len(kept) == len(SEEDS) - len(some)

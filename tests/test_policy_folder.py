@@ -20,7 +20,7 @@ from toy import SPEC
 from vla.api import load_policy
 from vla.io.errors import UserError
 from vla.models.policy_folder import TensorBudget, policy_folder, read_policy, require_unseen
-from vla.models.trunk_folder import opened
+from vla.models.trunk_folder import open_safetensors
 
 CONFIG: dict[str, Any] = {"task": {}, "tokenizer": {}, "model": {}}  # as much as a policy has at the least
 FILES = ["README.md", "config.json", "model.safetensors", "spec.json", "training.json"]
@@ -314,5 +314,8 @@ def test_parts_that_come_with_the_weights_are_no_larger_than_their_file(tmp_path
 
 def test_a_pipe_in_place_of_published_weights_is_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "model.safetensors")
-    with pytest.raises(UserError, match="is a folder, a pipe or a device"), opened(tmp_path / "model.safetensors"):
+    with (
+        pytest.raises(UserError, match="is a folder, a pipe or a device"),
+        open_safetensors(tmp_path / "model.safetensors"),
+    ):
         pass

@@ -20,7 +20,7 @@ from test_server import remote, serving
 from world import World, positions
 
 from vla.deploy.client_observation import Keys
-from vla.deploy.lifecycle_node import LATCHED
+from vla.deploy.lifecycle_node import LATCHED_QOS
 from vla.deploy.safety import State
 from vla.robots.panda import HOME
 
@@ -335,7 +335,7 @@ def test_whoever_comes_later_gets_the_last_status(make_world: Callable[..., Worl
     policy: Any = world.policy
     policy.chunk, policy.execute, policy.history, policy.chunking = 8, 4, 2, object()
     assert world.change(Transition.TRANSITION_CONFIGURE)
-    world.node.create_subscription(DiagnosticStatus, "/vla_agent/status", late.append, LATCHED)
+    world.node.create_subscription(DiagnosticStatus, "/vla_agent/status", late.append, LATCHED_QOS)
     world.spin(lambda: late)
     assert world.loop._execute == 1  # a history sees every step
 

@@ -19,7 +19,7 @@ from rich.table import Table
 from websockets.sync.server import ServerConnection, serve
 
 from vla.config.compose import CONF
-from vla.io.printable import printable, show
+from vla.io.printable import escape, show
 from vla.run import sentence
 
 TITLE = "\x1b]0;evil\x07"  # sets the title of a terminal
@@ -38,7 +38,7 @@ SHOWN = r"\x1b]0;evil\x07"
     ],
 )
 def test_hidden_characters_become_visible_and_others_stay(text: str, shown: str) -> None:
-    assert printable(text) == shown
+    assert escape(text) == shown
 
 
 def test_sentences_and_logs_of_a_run_are_printable() -> None:

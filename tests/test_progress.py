@@ -21,7 +21,7 @@ def out(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> io.S
     """What rich prints, on a terminal of 80 columns if the test asks for one."""
     console = Console(file=io.StringIO(), force_terminal=getattr(request, "param", False), width=80)
     monkeypatch.setattr("rich._console", console)
-    monkeypatch.setattr(progress, "EVERY", 0.0)
+    monkeypatch.setattr(progress, "LOG_INTERVAL", 0.0)
     return console.file  # type: ignore[return-value]
 
 
@@ -40,7 +40,7 @@ def test_a_pipe_gets_lines_and_a_terminal_a_bar(out: io.StringIO, caplog: pytest
 def test_lines_do_not_follow_each_other_closely(
     out: io.StringIO, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(progress, "EVERY", 1e6)
+    monkeypatch.setattr(progress, "LOG_INTERVAL", 1e6)
     with caplog.at_level("INFO"), Bar("collecting", 2) as bar:
         bar.show(1)
     assert not caplog.messages

@@ -17,11 +17,11 @@ from vla.rollouts.evaluate import evaluate
 from vla.rollouts.realtime import (
     BackgroundLink,
     Network,
-    OverNetwork,
+    NetworkedAgent,
     RealTime,
     SimulatedLink,
-    averaged,
-    make_over_network,
+    make_networked,
+    weighted_mean,
 )
 from vla.rollouts.rollout import rollout
 from vla.schedule import Schedule
@@ -67,17 +67,17 @@ def moves(actions: list[Array]) -> list[float]:
 
 
 def acted(network: Network, chunk: int, execute: int, steps: int, seed: int = 0) -> list[float]:
-    agent = OverNetwork(Counting(chunk, execute), network, SPEC)
+    agent = NetworkedAgent(Counting(chunk, execute), network, SPEC)
     agent.reset("", seed)
     return moves([agent.act(SEEN) for _ in range(steps)])
 
 
 def test_a_schedule_tells_whose_action_is_due() -> None:
     schedule = Schedule[str](0.5)
-    assert schedule.wants_plan(7.0, 1) and schedule.at(7.0) == [] and schedule.end == -np.inf
+    assert schedule.wants_plan(7.0, 1) and schedule.actions_at(7.0) == [] and schedule.end == -np.inf
     schedule.add("abc", 1.0)
     schedule.add("ABC", 2.0)  # of an observation at 2.0, whenever it arrives
-    due = {at: schedule.at(at) for at in (0.0, 1.0, 1.49, 1.5, 2.0, 2.5, 3.49, 3.5)}
+    due = {at: schedule.actions_at(at) for at in (0.0, 1.0, 1.49, 1.5, 2.0, 2.5, 3.49, 3.5)}
     assert due == {**{0.0: ["a", "A"], 1.0: ["a", "A"], 1.49: ["a", "A"]}, **{1.5: ["b", "A"], 2.0: ["c", "A"]}} | {
         2.5: ["B"],
         3.49: ["C"],
@@ -119,7 +119,7 @@ def test_jitter_and_loss_are_drawn_from_the_seed() -> None:
 
 def test_chunks_for_the_same_step_are_averaged_with_the_oldest_first() -> None:
     weights = np.exp([0.0, -0.5])
-    mean = averaged([np.full(1, 1.0), np.full(1, 2.0)], 0.5)
+    mean = weighted_mean([np.full(1, 1.0), np.full(1, 2.0)], 0.5)
     assert mean == pytest.approx((weights[0] * 1 + weights[1] * 2) / weights.sum()) and mean.dtype == np.float32
 
 
@@ -127,7 +127,7 @@ def test_an_evaluation_without_latency_is_that_of_the_policy_and_with_latency_re
     model = make_act(chunk=4, execute=2)
 
     def executed(network: Network) -> Array:
-        agent = OverNetwork(as_policy(model), network, toy.SPEC)
+        agent = NetworkedAgent(as_policy(model), network, toy.SPEC)
         return rollout(toy.make_environment(), agent, FIRST_SEED).executed
 
     expected = rollout(toy.make_environment(), as_policy(model), FIRST_SEED).executed
@@ -149,7 +149,7 @@ def test_by_the_clock_a_chunk_goes_on_while_the_next_one_is_under_way() -> None:
 def test_latency_costs_steps_and_then_success() -> None:
     seeds = range(FIRST_SEED, FIRST_SEED + 10)
     at_once, late, later = (
-        evaluate(toy.make_environment, partial(make_over_network, toy.make_expert, network_of(latency)), None, seeds)
+        evaluate(toy.make_environment, partial(make_networked, toy.make_expert, network_of(latency)), None, seeds)
         for latency in (0.0, 0.1, 0.4)
     )
     assert at_once == evaluate(toy.make_environment, toy.make_expert, None, seeds)
@@ -168,7 +168,7 @@ def test_an_arm_that_waits_stands_still_and_keeps_its_grip() -> None:
 def test_an_agent_with_a_history_sees_every_frame() -> None:
     agent = Counting(3, 3)
     agent.history = 2  # type: ignore[attr-defined]
-    distant = OverNetwork(agent, network_of(0.0), SPEC)
+    distant = NetworkedAgent(agent, network_of(0.0), SPEC)
     distant.reset("", 0)
     for _ in range(4):
         distant.act(SEEN)

@@ -22,8 +22,8 @@ from test_control_loop import World
 from test_server import serving
 
 from vla.config.build import build
-from vla.config.experiment import plain
-from vla.data.datamodule import held_out
+from vla.config.experiment import to_plain
+from vla.data.datamodule import is_held_out
 from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.imported_demonstrations import action_bounds
@@ -81,7 +81,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def composed(dataset: Path, *overrides: str) -> Any:
-    return plain(composing.composed("task=recorded", f"expert.folder={dataset}", *overrides))
+    return to_plain(composing.composed("task=recorded", f"expert.folder={dataset}", *overrides))
 
 
 def test_the_spec_is_the_datasets(dataset: Path) -> None:
@@ -235,7 +235,7 @@ def test_a_policy_is_trained_and_its_errors_measured_without_a_simulator(dataset
     recording, checkpoint = (*small(dataset), "collect.more=[further]"), tmp_path / "run"
     done = here(tmp_path, *recording, *TRAINING, *TINY, "hydra.run.dir=run", "output=run")
     errors = json.loads((tmp_path / "run/errors.json").read_text())
-    assert errors["seeds"] == [seed for seed in range(EPISODES) if held_out(seed, 0.2)]  # of the recording alone
+    assert errors["seeds"] == [seed for seed in range(EPISODES) if is_held_out(seed, 0.2)]  # of the recording alone
     assert [each["name"] for each in errors["components"]] == list(NAMES) and "success" not in errors
     assert all(each["ci_low"] <= each["error"] <= each["ci_high"] for each in errors["components"])
     assert "not a success rate" in done.stdout and "success" not in done.stdout.replace("not a success rate", "")
@@ -265,7 +265,7 @@ def test_a_policy_of_another_size_of_images_is_trained_further_and_evaluated(dat
     here(tmp_path, *recording, *TRAINING, "pretrained=run", "output=second", "hydra.run.dir=second")
     assert read_policy(tmp_path / "second").spec.image_size == (24, 32)
     errors = json.loads((tmp_path / "second/errors.json").read_text())
-    assert errors["seeds"] == [seed for seed in range(EPISODES) if held_out(seed, 0.2)]
+    assert errors["seeds"] == [seed for seed in range(EPISODES) if is_held_out(seed, 0.2)]
 
 
 def test_a_training_on_all_episodes_ends_with_success_and_is_complete(dataset: Path, tmp_path: Path) -> None:
@@ -296,7 +296,7 @@ def test_a_served_policy_is_compared_with_the_episodes_that_a_training_holds_out
         errors = json.loads((tmp_path / "theirs/errors.json").read_text())
         assert errors["checkpoint"] is None and errors["model"] == "remote"
     store = EpisodeStore(next(tmp_path.glob("outputs/episodes/*")))
-    unseen = [entry for entry in store.episodes if held_out(entry.seed, 0.2)]
+    unseen = [entry for entry in store.episodes if is_held_out(entry.seed, 0.2)]
     shown = [episode_of(store, entry) for entry in unseen]
     expected = open_loop(as_policy(policy.model, spec=spec), spec, shown, np.zeros(3))
     assert errors["seeds"] == [entry.seed for entry in unseen]

@@ -23,7 +23,7 @@ from toy_episodes import flip
 from vla import jobs
 from vla.config.compose import compose as compose_config
 from vla.config.compose import substitutes
-from vla.config.experiment import Experiment, plain
+from vla.config.experiment import Experiment, to_plain
 from vla.io.errors import UserError
 from vla.spec import Array
 from vla.tasks import gl
@@ -185,7 +185,7 @@ def test_a_window_is_a_part_of_what_a_camera_sees(renderer: Fast | Reference) ->
 @pytest.mark.parametrize(
     ("shape", "closed"),
     [
-        (shapes.box().scaled(np.array([0.1, 0.2, 0.3])), True),
+        (shapes.box().scale(np.array([0.1, 0.2, 0.3])), True),
         (shapes.sphere(28, 16), True),
         (shapes.cylinder(24), True),
         (shapes.capsule(24, 16, 0.1, 0.2), True),
@@ -275,17 +275,17 @@ def test_without_egl_mujocos_renderer_is_chosen_and_named(
 ) -> None:
     monkeypatch.setenv(gl.EGL_WORKS, "False")
     config = compose_config("output=here")
-    others = substitutes(plain(config.task), ["output=here"])
+    others = substitutes(to_plain(config.task), ["output=here"])
     usable = compose_config("output=here", *others)
     assert "the fast renderer needs EGL, which this machine lacks" in caplog.text
     assert "task/renderer=mujoco instead" in caplog.text
     folders = [compose_config("output=here", f"task/renderer={each}").collect.folder for each in ("mujoco", "fast")]
     assert usable.collect.folder == folders[0] != folders[1]
-    assert not substitutes(plain(config.task), ["task/renderer=fast"])  # and fails, in a sentence
+    assert not substitutes(to_plain(config.task), ["task/renderer=fast"])  # and fails, in a sentence
     monkeypatch.setenv(gl.EGL_WORKS, "True")
-    assert not substitutes(plain(config.task), [])
+    assert not substitutes(to_plain(config.task), [])
     for option, simulated in (("loop", True), ("simulator", True), ("ros2", False), ("server", False)):
-        deploying = Experiment.of(compose_config("job=deploy", f"deploy={option}", "output=here"))
+        deploying = Experiment.from_config(compose_config("job=deploy", f"deploy={option}", "output=here"))
         assert jobs.builds_world(deploying) == simulated
 
 
@@ -376,7 +376,7 @@ def test_a_heavy_mesh_is_decimated_once_and_keeps_its_texture(tmp_path: Path, mo
     def pictures(choice: Fast | Reference) -> Array:
         with closing(choice.open(model, views)) as renderer:
             if isinstance(renderer, FastRenderer) and choice == fast(faces=2000):
-                assert 1900 < sum(len(each.seen.triangles) for each in renderer._geometry.elements) < 2100
+                assert 1900 < sum(len(each.visible.triangles) for each in renderer._geometry.elements) < 2100
             return renderer.render(data)[0]
 
     reference, whole, fewer = (pictures(choice) for choice in (Reference(), fast(), fast(faces=2000)))

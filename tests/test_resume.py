@@ -14,7 +14,7 @@ from composing import composed
 from saved_policies import save_policy
 
 from vla.config.adopt import require_identity, resume
-from vla.config.experiment import plain
+from vla.config.experiment import to_plain
 from vla.reports.evaluation import write_report
 from vla.rollouts.results import Report, Result
 from vla.runs.resume import cached_success, newest_run, training_progress
@@ -36,13 +36,13 @@ def test_the_run_that_was_trained_last_is_the_newest(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="resume=last: nothing was trained in"):
         newest_run(tmp_path)
     for number, name in enumerate(("one", "rounds/round_1", "another")):
-        leave(tmp_path / name, plain(composed("job=train")), finished=False)
+        leave(tmp_path / name, to_plain(composed("job=train")), finished=False)
         os.utime(tmp_path / name / "checkpoints/last.ckpt", (number % 2, number % 2))
     assert newest_run(tmp_path) == tmp_path / "rounds"
 
 
 def test_a_training_without_rounds_is_not_resumed_as_one(tmp_path: Path) -> None:
-    leave(tmp_path / "one", plain(composed("job=train")), finished=True)
+    leave(tmp_path / "one", to_plain(composed("job=train")), finished=True)
     with pytest.raises(ValueError, match=r"one is a training without rounds: job=improve pretrained="):
         resume(composed(f"output={tmp_path}/now", "job=improve"), tmp_path / "one", ["job=improve"])
 
@@ -50,7 +50,7 @@ def test_a_training_without_rounds_is_not_resumed_as_one(tmp_path: Path) -> None
 def test_a_run_is_resumed_with_its_config_in_its_folder(tmp_path: Path) -> None:
     leave(
         tmp_path / "one",
-        plain(composed("job=train", "model.width=17", "collect.episodes=3", "trainer.accelerator=cpu", *OF_TRAINER)),
+        to_plain(composed("job=train", "model.width=17", "collect.episodes=3", "trainer.accelerator=cpu", *OF_TRAINER)),
         finished=False,
     )
     now = composed(f"output={tmp_path}/now", "trainer=auto", "trainer.gradient_clip_val=2", "evaluate.episodes=7")
@@ -72,16 +72,16 @@ def test_a_run_is_resumed_with_its_config_in_its_folder(tmp_path: Path) -> None:
 
 def test_one_machine_is_one_whether_a_trainer_says_so_or_not(tmp_path: Path) -> None:
     two = ("job=train", "trainer=ddp", "trainer.devices=2")
-    leave(tmp_path / "one", plain(composed(*two)), finished=False)
+    leave(tmp_path / "one", to_plain(composed(*two)), finished=False)
     said = ["trainer=auto", "trainer.devices=2"]
     now = resume(composed(f"output={tmp_path}/now", *said), tmp_path / "one", said)
     assert "num_nodes" not in now.trainer
-    require_identity(plain(composed(*two)), plain(now), tmp_path / "one")
+    require_identity(to_plain(composed(*two)), to_plain(now), tmp_path / "one")
 
 
 @pytest.mark.parametrize(("finished", "chosen"), [(False, False), (False, True), (True, False), (True, True)])
 def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: bool) -> None:
-    config = plain(composed())
+    config = to_plain(composed())
     assert training_progress(tmp_path, config) == (None, None)
     leave(tmp_path, config, finished, chosen)
     last = tmp_path / "checkpoints/last.ckpt"
@@ -89,40 +89,40 @@ def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: b
     expected = (None, tmp_path / "policy") if whole else (last, None)
     for name in ("metrics.csv", "report.json", "config.yaml"):
         (tmp_path / name).write_text("[1]")  # damaged, and not needed
-    assert training_progress(tmp_path, plain(composed("cluster.workers=1"))) == expected
-    assert training_progress(tmp_path, plain(composed("trainer.max_steps=1"))) == expected
-    assert training_progress(tmp_path, plain(composed("trainer.max_steps=99999"))) == (last, None)
+    assert training_progress(tmp_path, to_plain(composed("cluster.workers=1"))) == expected
+    assert training_progress(tmp_path, to_plain(composed("trainer.max_steps=1"))) == expected
+    assert training_progress(tmp_path, to_plain(composed("trainer.max_steps=99999"))) == (last, None)
     for other in ("model.width=17", "+trainer.sync_batchnorm=true", "+trainer.gradient_clip_algorithm=value"):
         key = other.strip("+").partition("=")[0]
         with pytest.raises(ValueError, match=rf"differs in {re.escape(key)}: choose another output=DIR"):
-            training_progress(tmp_path, plain(composed(other)))
+            training_progress(tmp_path, to_plain(composed(other)))
 
 
 def test_a_finished_training_needs_no_checkpoint(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    save_policy(tmp_path / "policy", plain(composed()), global_step=2000)
+    save_policy(tmp_path / "policy", to_plain(composed()), global_step=2000)
     done = (None, tmp_path / "policy")
     with caplog.at_level("WARNING"):
-        assert training_progress(tmp_path, plain(composed())) == done and not caplog.records
-        assert training_progress(tmp_path, plain(composed("trainer.max_steps=1000"))) == done
+        assert training_progress(tmp_path, to_plain(composed())) == done and not caplog.records
+        assert training_progress(tmp_path, to_plain(composed("trainer.max_steps=1000"))) == done
     assert "was trained for 2000 steps, more than trainer.max_steps" in caplog.text
     with pytest.raises(ValueError, match=r"differs in model\.width: choose another output=DIR"):
-        training_progress(tmp_path, plain(composed("model.width=17")))
+        training_progress(tmp_path, to_plain(composed("model.width=17")))
     with pytest.raises(ValueError, match=r"a longer training would continue from .*last\.ckpt, which is gone: choose"):
-        training_progress(tmp_path, plain(composed("trainer.max_steps=3000")))
+        training_progress(tmp_path, to_plain(composed("trainer.max_steps=3000")))
 
 
 def test_a_report_of_older_weights_or_compared_with_an_older_run_is_not_this_one(tmp_path: Path) -> None:
     policy, other, replayed = (tmp_path / name for name in ("policy", "other/report.json", "store/index.jsonl"))
     for file in (other, replayed):
         file.parent.mkdir()
-    asked = plain(composed(f"evaluate.against={other.parent}", f"evaluate.nearest={replayed.parent}"))
+    asked = to_plain(composed(f"evaluate.against={other.parent}", f"evaluate.nearest={replayed.parent}"))
     report = Report((Result(1_000_000, "success"), Result(1_000_001, "dropped")))
     for changed in (other, replayed):
         for file in (other, replayed):
             file.touch()
         write_report(report, tmp_path / "report.json", str(policy), asked, {"weights": "1"})
         assert cached_success(tmp_path, asked, policy, "1") == 0.5
-        assert cached_success(tmp_path, plain(composed("evaluate.episodes=9")), policy, "1") is None
+        assert cached_success(tmp_path, to_plain(composed("evaluate.episodes=9")), policy, "1") is None
         assert cached_success(tmp_path, asked, policy, "2") is None  # copied here with its date
         os.utime(changed, (time.time() + 10, time.time() + 10))
         assert cached_success(tmp_path, asked, policy, "1") is None

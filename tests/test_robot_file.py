@@ -34,7 +34,7 @@ from defaults import defaults_of
 from test_control_loop import World
 
 from vla.config.build import require_no_paths
-from vla.config.experiment import plain
+from vla.config.experiment import to_plain
 from vla.deploy.control_loop import ControlLoop
 from vla.deploy.joint_limiter import JointLimits
 from vla.robots.chain import forward_of
@@ -280,13 +280,13 @@ def test_what_does_not_fit_the_model_is_named(tmp_path: Path, changes: dict[str,
 
 
 def test_a_checkpoint_names_no_file_but_of_a_package(tmp_path: Path) -> None:
-    config: Any = {"task": plain(composed(*chosen(tmp_path / "arm.xml")))["task"]}
+    config: Any = {"task": to_plain(composed(*chosen(tmp_path / "arm.xml")))["task"]}
     with pytest.raises(
         ValueError, match=r"last\.ckpt names a path .* in task\.robot\.file: .*; task/robot=OPTION gives yours"
     ):
         require_no_paths(config, ("task",), "last.ckpt", ())
     require_no_paths(config, ("task",), "last.ckpt", ("task.robot",))
-    require_no_paths({"task": plain(composed("task/robot=jaco"))["task"]}, ("task",), "last.ckpt", ())
+    require_no_paths({"task": to_plain(composed("task/robot=jaco"))["task"]}, ("task",), "last.ckpt", ())
 
 
 @pytest.mark.parametrize(

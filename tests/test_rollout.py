@@ -16,23 +16,23 @@ STEPS = len(EPISODE.executed)
 
 
 def test_a_replay_goes_where_the_rollout_went() -> None:
-    assert replay(ToyEnvironment(), EPISODE).differs is None
+    assert replay(ToyEnvironment(), EPISODE).first_difference is None
 
 
 def test_the_first_step_that_differs_is_told() -> None:
-    assert replay(ToyEnvironment(forgetful=True), EPISODE).differs == 0
+    assert replay(ToyEnvironment(forgetful=True), EPISODE).first_difference == 0
     executed = EPISODE.executed.copy()
     executed[4] += 0.01
-    assert replay(ToyEnvironment(), replace(EPISODE, executed=executed)).differs == 5
+    assert replay(ToyEnvironment(), replace(EPISODE, executed=executed)).first_difference == 5
 
 
 def test_another_end_differs_even_if_all_joints_are_the_same() -> None:
-    assert replay(ToyEnvironment(), replace(EPISODE, outcome="timeout")).differs == STEPS
+    assert replay(ToyEnvironment(), replace(EPISODE, outcome="timeout")).first_difference == STEPS
     short = replace(EPISODE, observations=EPISODE.observations[:-1], executed=EPISODE.executed[:-1])
-    assert replay(ToyEnvironment(), short).differs == STEPS - 1
+    assert replay(ToyEnvironment(), short).first_difference == STEPS - 1
     longer = [*EPISODE.observations, EPISODE.observations[-1]]
     executed = np.concatenate([EPISODE.executed, EPISODE.executed[-1:]])
-    assert replay(ToyEnvironment(), replace(EPISODE, observations=longer, executed=executed)).differs == STEPS
+    assert replay(ToyEnvironment(), replace(EPISODE, observations=longer, executed=executed)).first_difference == STEPS
 
 
 class Planning(ToyExpert):

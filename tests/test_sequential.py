@@ -16,7 +16,7 @@ from vla.rollouts.comparison import Pairs, compare_pairs
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.results import Report, Result
 from vla.rollouts.sequential import anytime_difference, anytime_interval, anytime_p, excludes, is_decided, log_capital
-from vla.rollouts.statements import AgainstBar, AgainstRun
+from vla.rollouts.statements import BarStatement, RunStatement
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import FIRST_SEED
 
@@ -86,15 +86,15 @@ def test_policies_that_are_equal_or_a_margin_apart_are_rarely_called_otherwise(l
 
 
 def test_an_evaluation_stops_when_it_is_clear_whatever_the_number_of_workers() -> None:
-    until = AgainstBar(0.5).is_decided
+    until = BarStatement(0.5).is_decided
     alone = evaluate(toy.make_environment, toy.make_agent, None, SEEDS, until=until)
     assert evaluate(toy.make_environment, toy.make_agent, None, SEEDS, Cluster(2, "beside"), until=until) == alone
     assert alone.anytime and [result.seed for result in alone.results] == [*SEEDS[: alone.episodes]]
     assert until(alone) and not any(until(Report(alone.results[:played])) for played in range(alone.episodes))
     assert alone.interval[0] > 0.5 and "anytime-valid 95 % CI" in str(alone)
-    assert AgainstBar(0.5).say(alone) == "success is above the bar of 50 %"
-    everything = evaluate(toy.make_environment, toy.make_agent, None, SEEDS[:4], until=AgainstBar(0.7).is_decided)
-    assert everything.episodes == 4 and "open" in AgainstBar(0.7).say(everything)
+    assert BarStatement(0.5).say(alone) == "success is above the bar of 50 %"
+    everything = evaluate(toy.make_environment, toy.make_agent, None, SEEDS[:4], until=BarStatement(0.7).is_decided)
+    assert everything.episodes == 4 and "open" in BarStatement(0.7).say(everything)
 
 
 def test_tasks_that_take_turns_are_played_in_whole_rounds() -> None:
@@ -105,7 +105,7 @@ def test_tasks_that_take_turns_are_played_in_whole_rounds() -> None:
 
 
 def test_a_run_is_compared_on_the_episodes_that_both_played() -> None:
-    other = AgainstRun("A", {result.seed: result for result in a_report("0" * 12).results}, 0.02)
+    other = RunStatement("A", {result.seed: result for result in a_report("0" * 12).results}, 0.02)
     assert not other.is_decided(a_report("111e11", True)) and other.is_decided(a_report("1" * 9, True))
     assert other.say(a_report("1" * 10 + "e111", True)).startswith(
         "compared with A on 11 common episodes: better, +100.0 points"
@@ -114,12 +114,12 @@ def test_a_run_is_compared_on_the_episodes_that_both_played() -> None:
     assert ": better, " in other.say(some) and ": open, " in stopped.say(some)  # six pairs, chosen by when it stopped
     ended = replace(other, results={FIRST_SEED: a_report("0").results[0]})
     assert ended.is_decided(a_report("1", True))  # no later episode can decide
-    failed = AgainstRun("A", {result.seed: result for result in a_report("e" + "0" * 12).results}, 0.02)
+    failed = RunStatement("A", {result.seed: result for result in a_report("e" + "0" * 12).results}, 0.02)
     assert not failed.is_decided(a_report("1", True))  # the other run did not complete that episode
     failed.require_common([FIRST_SEED, FIRST_SEED + 1])
     with pytest.raises(ValueError, match="has no episode in common"):
         failed.require_common([FIRST_SEED, FIRST_SEED + 13])
-    elsewhere = AgainstRun("A", {FIRST_SEED: Result(FIRST_SEED, "success", "push")}, 0.02)
+    elsewhere = RunStatement("A", {FIRST_SEED: Result(FIRST_SEED, "success", "push")}, 0.02)
     assert elsewhere.say(a_report("1", True)) == "no episode in common with A"
     with pytest.raises(ValueError, match="has no episode in common"):
         elsewhere.is_decided(a_report("1", True))

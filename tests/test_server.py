@@ -46,7 +46,7 @@ from vla.models.model import Model
 from vla.policy import Policy
 from vla.rollouts.evaluate import play_episode
 from vla.rollouts.remote import Component, RemotePolicy
-from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Array, Observation, Running
+from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Array, Observation, RunningPlan
 
 TEXTS = ("go", "lift it now", "go", "put it down")
 KEYS = Keys({"eye": "observation/image"}, ["observation/state"], "prompt")
@@ -60,7 +60,7 @@ def settings(policy: Policy, **changes: Any) -> PolicyServer:
 
 def serving(policy: Policy, **changes: Any) -> AbstractContextManager[str]:
     """A server in a thread of its own, by its URL."""
-    return Service(settings(policy, **changes), policy).in_thread()
+    return Service(settings(policy, **changes), policy).serve_in_thread()
 
 
 def client(url: str, **options: Any) -> ClientConnection:
@@ -181,10 +181,10 @@ def test_a_plan_goes_on_from_the_one_that_a_client_executes() -> None:
         agent.reset(seen[0].instruction, 0)
         acted = [agent.act(observation) for observation in seen]
         for number in (0, 2, 4):  # without delay nothing is certain, and two actions of each plan are executed
-            running = Running(plans[-1][2:], 0) if plans else None
+            running = RunningPlan(plans[-1][2:], 0) if plans else None
             plans.append(expected.plan(replace(seen[number], running=running)))
         np.testing.assert_array_equal(acted, [*plans[0][:2], *plans[1][:2], plans[2][0]])
-        late = replace(seen[0], running=Running(plans[2][1:], 3))
+        late = replace(seen[0], running=RunningPlan(plans[2][1:], 3))
         np.testing.assert_array_equal(agent.plan(late)[:3], plans[2][1:4])
         mapped = {name: Component(index, 1.0, 0.0) for index, name in enumerate(SPEC.action)}
         with closing(remote(agent.url, actions=mapped)) as other:
@@ -557,7 +557,7 @@ def test_a_key_and_images_go_to_the_named_server_only() -> None:
 
 def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:
     common = (*SMALL, "evaluate.episodes=1", "task.time_limit=1", "recorder=none")
-    environment = Experiment.of(composed(*common)).make_environment()()
+    environment = Experiment.from_config(composed(*common)).make_environment()()
     policy = as_policy(make_bc(spec=environment.spec), spec=environment.spec)
     expected = play_episode(environment, as_policy(policy.model, spec=environment.spec), FIRST_SEED)
     environment.close()

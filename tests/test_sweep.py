@@ -18,7 +18,7 @@ from rich.console import Console
 
 from vla.io.errors import UserError
 from vla.jobs.sweep import SweepTable
-from vla.reports.comparison import Compared, common_episodes, compare
+from vla.reports.comparison import Comparisons, common_episodes, compare
 from vla.reports.comparison_page import results_table, tabulate
 from vla.reports.evaluation import write_report
 from vla.reports.tables import Table
@@ -73,7 +73,7 @@ def printed(table: Table) -> str:
     return console.export_text()
 
 
-def compare_rows(rows: list[SweepRow]) -> Compared:
+def compare_rows(rows: list[SweepRow]) -> Comparisons:
     """Every row with the first one."""
     return compare(((rows[0], other) for other in rows[1:]), 0.02)
 
@@ -89,7 +89,7 @@ def test_seeds_are_put_together_and_the_rest_is_told_apart(tmp_path: Path, figur
     assert (
         lines[0] == "| model | seen [%] | dark [%] | each seed [%] | parameters [M] | action [ms] | steps | training |"
     )
-    low, high = (100 * bound for bound in pooled_interval(bc.played["seen"]))
+    low, high = (100 * bound for bound in pooled_interval(bc.successes["seen"]))
     assert f"| bc | 80.0 ({low:.1f}-{high:.1f}) |" in lines[2] and lines[2].endswith(
         "| 90.0, 70.0 | 2.00 | 2.0 | - | - |"
     )

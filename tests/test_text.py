@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 from vla.config.compose import axes
 from vla.io.errors import UserError
-from vla.models.text.colours import in_basic_terms
+from vla.models.text.colours import to_basic_terms
 from vla.models.text.ngrams import NGrams
 from vla.tasks.tabletop.scene import COLOURS
 
@@ -62,7 +62,7 @@ def test_every_name_of_a_block_that_training_never_has_means_its_colour() -> Non
     names = axes()["task/randomize/phrasing"]["unseen_names"]["words"]
     for colour in COLOURS:
         for name in names[f"the {colour} block"]:
-            assert colour in in_basic_terms(name.split()), name
+            assert colour in to_basic_terms(name.split()), name
 
 
 SAID = {"block": "red", "other": "blue", "pad": "black", "rest": "white"}

@@ -157,7 +157,7 @@ def test_it_logs_how_fast_it_is_and_what_it_waits_for(folder: Path, tmp_path: Pa
 def test_what_never_happens_in_a_training_is_said(
     overrides: tuple[str, ...], said: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    warn_of_length(Experiment.of(composed(*overrides)))
+    warn_of_length(Experiment.from_config(composed(*overrides)))
     assert len(caplog.messages) == len(said) and all(text in caplog.text for text in said)
 
 
@@ -230,9 +230,9 @@ def test_the_best_weights_are_chosen_if_the_last_ones_are_clearly_worse(folder: 
     rates, run = iter([10, 18, 18, 15]), tmp_path / "run"
     played = ClosedLoop(toy.make_environment, lambda model: Partial(next(rates)), seeds, run)
     train(make_bc(), folder, run, killer=played, max_steps=4, val_check_interval=1)
-    assert (played.best, played.success) == (0.9, 0.75) and played.clearly_better() is None
+    assert (played.best, played.success) == (0.9, 0.75) and played.clearly_better_policy() is None
     played.success = 13 / 20
-    assert played.clearly_better() == run / "policy_best"
+    assert played.clearly_better_policy() == run / "policy_best"
     made = json.loads((run / "policy_best/training.json").read_text())
     assert (made["steps"], made["figures"]["val/success"]) == (3, pytest.approx(0.9))
     for others, best in ((seeds, 0.9), (seeds[:-1], -1.0)):
@@ -247,7 +247,7 @@ def test_a_validation_without_a_played_episode_selects_nothing(folder: Path, tmp
     train(make_bc(), folder, run, killer=played, max_steps=2, val_check_interval=1)
     assert (played.best, played.success) == (1.0, 1.0)
     assert json.loads((run / "policy_best/training.json").read_text())["steps"] == 1
-    assert played.clearly_better() is None
+    assert played.clearly_better_policy() is None
 
 
 def test_between_validations_no_environment_is_held(folder: Path, tmp_path: Path) -> None:

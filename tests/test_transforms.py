@@ -21,7 +21,7 @@ from vla.data.window_batches import WindowBatcher
 from vla.deploy import messages
 from vla.deploy.client_observation import Keys
 from vla.deploy.inference import Inference
-from vla.io.images import Fit, fitted, resize
+from vla.io.images import Fit, fit_images, resize
 from vla.io.parts import Part
 from vla.models.layers import Batch
 from vla.models.model import Model
@@ -31,7 +31,7 @@ TRAINED, RAW = replace(SPEC, image_size=(16, 24)), replace(SPEC, image_size=(45,
 
 
 def resized(image: np.ndarray, size: tuple[int, int], fit: Fit) -> np.ndarray:
-    return fitted(torch.from_numpy(image)[None, None], size, fit)[0, 0].numpy()
+    return fit_images(torch.from_numpy(image)[None, None], size, fit)[0, 0].numpy()
 
 
 def test_the_centre_is_used_or_all_is_squeezed_or_framed() -> None:
@@ -50,7 +50,7 @@ def test_any_size_is_taken_and_the_size_itself_is_left_alone(fit: Fit) -> None:
         image = resized(np.full((*shape, 3), 77, np.uint8), (96, 64), fit)
         assert image.shape == (96, 64, 3) and set(np.unique(image)) <= {0, 77} and (image == 77).any()
     images = torch.zeros(2, 3, 96, 64, 3, dtype=torch.uint8)
-    assert fitted(images, (96, 64), fit) is images
+    assert fit_images(images, (96, 64), fit) is images
 
 
 @pytest.mark.parametrize("fit", FITS)
@@ -99,7 +99,7 @@ def in_the_node(model: Model, seen: Any) -> object:
     message = messages.fill_image(SimpleNamespace(header=SimpleNamespace()), seen.rgb["eye"], "eye")
     observation = replace(seen, rgb={"eye": messages.image_from(message)})
     inference = Inference(as_policy(model, spec=TRAINED))
-    inference.start(observation, first=True)
+    inference.start(observation, is_first=True)
     inference.close()
     return inference.take()
 

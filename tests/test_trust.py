@@ -17,8 +17,8 @@ from saved_policies import change_json, save_policy, save_run
 from toy_episodes import EPISODES, add
 
 from vla.config.adopt import adopt, finetune, resume
-from vla.config.annotations import LIBRARY, OWN, locate
-from vla.config.experiment import make_policy, plain
+from vla.config.annotations import LIBRARY, OWN_PREFIX, locate
+from vla.config.experiment import make_policy, to_plain
 from vla.io.errors import UserError
 
 # Everything under these could be named once, and some of it acts when it is built.
@@ -47,7 +47,7 @@ def test_no_class_of_a_library_is_within_reach() -> None:
 def test_the_library_classes_that_may_be_built_are_those_of_the_options() -> None:
     texts = [path.read_text(encoding="utf-8") for path in CONF.rglob("*.yaml")]
     named = {name for text in texts for name in re.findall(r"_target_: (\S+)", text)}
-    assert {name for name in named if not name.startswith(OWN)} == set(LIBRARY)
+    assert {name for name in named if not name.startswith(OWN_PREFIX)} == set(LIBRARY)
 
 
 ATTACKS = list(hostile(Path()))
@@ -62,7 +62,7 @@ def toy_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run_of(path: Path, key: str, value: Any) -> Path:
     """A run whose configuration is the default one but for a key."""
-    config = plain(composed("expert=clean", "trainer.accelerator=cpu"))
+    config = to_plain(composed("expert=clean", "trainer.accelerator=cpu"))
     put(config, key, value)
     return save_run(path, config)
 
@@ -92,7 +92,7 @@ def test_nothing_that_a_policy_names_is_run(tmp_path: Path, attack: str, monkeyp
 def test_nothing_that_a_store_names_is_run(tmp_path: Path, attack: str, toy_store: Path) -> None:
     mark = tmp_path / "mark"
     key, value = hostile(mark)[attack]
-    config = {"task": plain(composed("expert=clean", "trainer.accelerator=cpu"))["task"], "expert": {}}
+    config = {"task": to_plain(composed("expert=clean", "trainer.accelerator=cpu"))["task"], "expert": {}}
     put(config, key if key.startswith("task.") else "task.goal", value)
     shutil.copytree(toy_store, tmp_path / "store")
     header = json.loads((tmp_path / "store/store.json").read_text())
@@ -103,7 +103,7 @@ def test_nothing_that_a_store_names_is_run(tmp_path: Path, attack: str, toy_stor
 
 
 def test_only_ones_own_runs_are_resumed(tmp_path: Path) -> None:
-    save_run(tmp_path / "theirs", plain(composed("collect.folder=/nowhere")))
+    save_run(tmp_path / "theirs", to_plain(composed("collect.folder=/nowhere")))
     elsewhere = composed(f"output={tmp_path}/elsewhere/mine")
     with pytest.raises(ValueError, match="is not among your runs"):
         resume(elsewhere, tmp_path / "theirs", [])
@@ -112,7 +112,7 @@ def test_only_ones_own_runs_are_resumed(tmp_path: Path) -> None:
 
 
 def test_a_path_in_somebody_elses_policy_is_refused(tmp_path: Path) -> None:
-    config = plain(composed())
+    config = to_plain(composed())
     config["task"]["goal"] = node("vla.data.formats.lerobot_import.LeRobotDemonstrations", folder="/nowhere")
     path = save_policy(tmp_path / "theirs", config)
     with pytest.raises(ValueError, match=r"theirs names a path or an address in task\.goal\.folder"):
@@ -121,7 +121,7 @@ def test_a_path_in_somebody_elses_policy_is_refused(tmp_path: Path) -> None:
 
 def test_folders_loggers_and_devices_are_never_those_of_a_policy(tmp_path: Path) -> None:
     theirs: dict[str, Any] = {
-        **plain(composed("expert=lerobot", "expert.folder=/theirs", "collect.episodes=7", "trainer.max_steps=9")),
+        **to_plain(composed("expert=lerobot", "expert.folder=/theirs", "collect.episodes=7", "trainer.max_steps=9")),
         **{"output": "/theirs", "pretrained": "/theirs", "resume": "/theirs", "checkpoint": "/theirs"},
         "logger": {"csv": {"_target_": "lightning.pytorch.loggers.CSVLogger", "name": "/theirs"}},
     }
@@ -135,9 +135,9 @@ def test_folders_loggers_and_devices_are_never_those_of_a_policy(tmp_path: Path)
         *(adopt(composed(*own, f"checkpoint={path}", f"job={job}"), []) for job in ("evaluate", "export", "benchmark")),
         finetune(composed(*own, f"pretrained={path}"), []),
     ):
-        assert "theirs" not in repr(plain(adopted))
-        assert plain(adopted)["trainer"].get("devices") != 99
-    reported = plain(adopt(composed(*own, f"checkpoint={path}"), []))
+        assert "theirs" not in repr(to_plain(adopted))
+        assert to_plain(adopted)["trainer"].get("devices") != 99
+    reported = to_plain(adopt(composed(*own, f"checkpoint={path}"), []))
     assert (reported["collect"]["episodes"], reported["trainer"]["max_steps"]) == (7, 9)
     assert reported["expert"] == {**theirs["expert"], "folder": None}
 
@@ -147,4 +147,4 @@ def test_a_model_that_its_weights_do_not_fill_is_refused_before_it_is_made(tmp_p
     config = path / "policy/config.json"
     change_json(config, lambda nodes: {**nodes, "model": nodes["model"] | {"text_width": 16384}})
     with pytest.raises(ValueError, match="describes a model that is larger than its weights"):
-        make_policy(plain(composed().policy), path)
+        make_policy(to_plain(composed().policy), path)

@@ -137,7 +137,7 @@ def test_what_rarely_or_never_changes_is_normalised_without_explosions() -> None
 def test_repeated_last_actions_count_where_others_attend_to_them(causal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SmolVLA, "causal", causal)
     model = make_smolvla()
-    batch = model.noised(with_text(model, make_batch(1, CHUNK, spec=SPEC)))
+    batch = model.with_noise(with_text(model, make_batch(1, CHUNK, spec=SPEC)))
     batch["perturbations"] = torch.zeros_like(batch["perturbations"])
     batch["perturbations"][..., -1] = -1  # beyond the episode
     batch["valid"] = batch["perturbations"] == 0
@@ -219,7 +219,7 @@ def test_training_and_planning_compile_as_one_graph_each() -> None:
     with torch.inference_mode():
         compiled = torch.compile(model.predict, backend="eager", fullgraph=True)
         assert deviation(compiled(batch).actions, model.predict(batch).actions) < 1e-5
-    batch = model.noised(batch)
+    batch = model.with_noise(batch)
     compiled = torch.compile(model.train().loss, backend="eager", fullgraph=True)
     assert deviation(compiled(batch)["loss"].detach(), model.loss(batch)["loss"].detach()) < 1e-5
 

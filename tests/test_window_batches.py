@@ -17,7 +17,7 @@ from vla.data import episodes
 from vla.data.episodes import EpisodeStore
 from vla.data.fields import Field, ScatteredRows
 from vla.data.header import RAW
-from vla.data.window_batches import BufferPool, WindowBatcher, perturbed
+from vla.data.window_batches import BufferPool, WindowBatcher, is_perturbed
 from vla.io.errors import UserError
 
 
@@ -31,7 +31,7 @@ def test_a_step_is_perturbed_if_the_executed_action_differs_from_the_label_by_mo
         label * [1, -1, 1],
         [0.04, 0, 0],
     ]
-    off = perturbed(np.tile(label, (6, 1)), np.array(executed), toy.SPEC)
+    off = is_perturbed(np.tile(label, (6, 1)), np.array(executed), toy.SPEC)
     assert off.tolist() == [False, False, False, True, True, True]
 
 
@@ -95,7 +95,9 @@ def test_batches_of_a_store_that_is_larger_than_the_memory_are_the_same(
     small = WindowBatcher(EpisodeStore(folder), history, 2)
     monkeypatch.setattr(episodes, "memory", lambda: 1)
     store = EpisodeStore(folder)
-    assert all(isinstance(store.rows(f"rgb_{camera}", scattered=True), ScatteredRows) for camera in store.spec.cameras)
+    assert all(
+        isinstance(store.rows(f"rgb_{camera}", in_random_order=True), ScatteredRows) for camera in store.spec.cameras
+    )
     large = WindowBatcher(store, history, 2)
     large.verify()
     windows = np.random.default_rng(0).integers(0, store.episodes[-1].end, 40)

@@ -16,7 +16,7 @@ from collecting import until
 from psutil import Process
 
 from vla.io.errors import UserError
-from vla.parallel.pool import Crashed, ProcessPool
+from vla.parallel.pool import ProcessPool, WorkerCrash
 
 
 class Doubling:
@@ -63,7 +63,7 @@ def results(make: Any, *numbers: int) -> list[Any]:
 def test_only_the_item_that_crashes_its_process_twice_is_lost() -> None:
     one, lost, *others = results(Doubling, 1, 7, 2, 3)
     assert (one, *others) == (2, 4, 6)
-    assert isinstance(lost, Crashed) and str(lost).startswith(
+    assert isinstance(lost, WorkerCrash) and str(lost).startswith(
         "a worker process crashed twice: it was ended by signal 11 ("
     )
 
@@ -88,7 +88,7 @@ def test_workers_are_numbered(tmp_path: Path) -> None:
 def test_an_error_or_result_that_cannot_be_sent_is_told_in_words_and_no_crash() -> None:
     one, error, other = results(Doubling, 1, 8, 9)
     assert one == 2 and type(error) is RuntimeError and str(error) == "Awkward: eight is 8"
-    assert not isinstance(other, Crashed) and "pickle" in str(other)
+    assert not isinstance(other, WorkerCrash) and "pickle" in str(other)
 
 
 def test_a_process_that_is_killed_while_it_starts_is_replaced(tmp_path: Path) -> None:

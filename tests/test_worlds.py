@@ -17,7 +17,7 @@ from vla.models.model import Model
 from vla.policy import Policy
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.rollout import rollout
-from vla.rollouts.worlds import Stage, in_lanes, play
+from vla.rollouts.worlds import Stage, as_agents, play
 from vla.spec import FIRST_SEED, Array, Episode, Observation
 
 MODELS: dict[str, Callable[[], Model]] = {
@@ -90,11 +90,11 @@ def test_where_a_new_instruction_needs_an_image_only_its_episode_is_run_again() 
 
 def test_an_agent_of_one_world_plays_in_one() -> None:
     expert = ToyExpert()
-    played = dict(play(worlds(1), in_lanes(expert), [4, 1]))
+    played = dict(play(worlds(1), as_agents(expert), [4, 1]))
     for seed, episode in played.items():
         np.testing.assert_array_equal(episode.executed, rollout(ToyEnvironment(), expert, seed).executed)
     with pytest.raises(ValueError, match=r"ToyInTurn has no `info`: set self\.info"):
-        in_lanes(ToyInTurn())  # type: ignore[arg-type]
+        as_agents(ToyInTurn())  # type: ignore[arg-type]
 
 
 def test_an_evaluation_in_lanes_reports_the_same() -> None:

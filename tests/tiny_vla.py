@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from vla.models.tokenizers.tokenizer import Uniform
-from vla.models.vlm.network import FlowNetwork, renamed
+from vla.models.vlm.network import FlowNetwork, rename_weight
 from vla.models.vlm.policy import VisionLanguageAction
 from vla.models.vlm.prompt import WORDS, Prompt
 from vla.models.vlm.smolvla import SmolVLA
@@ -122,8 +122,8 @@ def make_smolvla(tokenizer: Path | None = None, **options: Any) -> VisionLanguag
 
 def published(network: Any) -> Iterable[tuple[str, Tensor]]:
     """Name in LeRobot's class and weight."""
-    beginnings = [(ours, theirs.removeprefix("model.")) for theirs, ours in network.published]
-    return ((renamed(name, beginnings), weight) for name, weight in network.named_parameters())
+    beginnings = [(ours, theirs.removeprefix("model.")) for theirs, ours in network.published_names]
+    return ((rename_weight(name, beginnings), weight) for name, weight in network.named_parameters())
 
 
 # Weights whose gradients are compared, by the names in LeRobot's class.

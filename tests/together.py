@@ -59,7 +59,7 @@ SMALL = (
 
 def composed(*overrides: str) -> Experiment:
     """An experiment of few and small steps."""
-    return Experiment.of(composing.composed(*SMALL, *overrides))
+    return Experiment.from_config(composing.composed(*SMALL, *overrides))
 
 
 def untrained(store: Path, *overrides: str) -> Learner:
@@ -121,7 +121,7 @@ def share_vlas(store: Path, folder: Path) -> None:
     for name, make in VLAS.items():
         torch.manual_seed(0)
         model = make()
-        batch = model.noised(with_text(model, make_batch(1, model.chunk, spec=model.spec, size=2)))
+        batch = model.with_noise(with_text(model, make_batch(1, model.chunk, spec=model.spec, size=2)))
         LoRA(**defaults_of("learner/lora/low_rank", rank=2)).inject(model)
         recompute_layers(model.train())
         whole = copy.deepcopy(model)

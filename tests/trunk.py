@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from transformers import LlamaConfig, LlamaModel
 
 from vla.models.act import ACT
-from vla.models.context import Context, Encoded, Proprioception
+from vla.models.context import Context, EncodedContext, Proprioception
 
 SIZES = {"hidden_size": 32, "intermediate_size": 64, "num_attention_heads": 2, "num_hidden_layers": 3, "vocab_size": 4}
 
@@ -26,11 +26,11 @@ class TrunkContext(Context):
         self.image_token, self.text_token = nn.Linear(3, self.width), nn.Linear(self.text_width, self.width)
         self.trunk = LlamaModel(LlamaConfig(**SIZES))
 
-    def forward(self, batch: dict[str, Any], text: Tensor) -> Encoded:
+    def forward(self, batch: dict[str, Any], text: Tensor) -> EncodedContext:
         images = [self.image_token(images[:, -1].float().mean((1, 2)) / 255) for images in batch["rgb"].values()]
         tokens = [*images, self.state_token(self.proprioception(batch)[:, -1]), self.text_token(text)]
         hidden = self.trunk(inputs_embeds=torch.stack(tokens, 1)).last_hidden_state
-        return Encoded(hidden, hidden[:, -1])
+        return EncodedContext(hidden, hidden[:, -1])
 
 
 def make_trunk_model(**options: Any) -> ACT:

@@ -24,10 +24,10 @@ from vla.models.compile_cache import set_compile_cache
 from vla.models.layers import Batch
 from vla.models.model import Model
 from vla.schedule import Schedule
-from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Running, Spec
+from vla.spec import LONGEST_INSTRUCTION, Array, Observation, RunningPlan, Spec
 
-Seen = Observation | Mapping[str, Any] | Sequence[Observation]  # of one lane, or of several
-NOTHING = Running(np.empty((0, 1), np.float32), 0)  # no plan is executed
+PolicyInput = Observation | Mapping[str, Any] | Sequence[Observation]  # of one lane, or of several
+NO_PLAN = RunningPlan(np.empty((0, 1), np.float32), 0)  # no plan is executed
 LONG_SENTENCE = " ".join(["sentence"] * 24)  # shorter instructions are padded to it for a constant shape
 
 
@@ -132,7 +132,7 @@ class Policy:
     def _wants_plan(self, lane: int) -> bool:
         return self._lanes[lane].schedule.wants_plan(self._lanes[lane].step, self.execute)
 
-    def act(self, observations: Seen, lanes: Sequence[int] | None = None) -> Array:
+    def act(self, observations: PolicyInput, lanes: Sequence[int] | None = None) -> Array:
         """Return the next actions of n lanes, (n, D) float32, clipped to the spec, given an observation of each.
 
         Without `lanes`, return the action (D,) for one observation of lane 0, also one of `vla.api.load_environment`.
@@ -144,20 +144,20 @@ class Policy:
             return self.act([self._observation(observations)], [0])[0]
         lane_observations = self._assign_lanes(observations, lanes)
         self._observe({lane: observation for lane, observation in lane_observations.items() if self.looking(lane)})
-        running = dict[int, Running]()  # the end of the old plan of every lane that wants a new one
+        running = dict[int, RunningPlan]()  # the end of the old plan of every lane that wants a new one
         for lane in filter(self._wants_plan, lanes):
-            rest = [action for action, _ in self._lanes[lane].schedule.remaining(self._lanes[lane].step)]
-            running[lane] = Running(np.reshape(rest, (-1, len(self._low))), 0)
+            rest = [action for action, _ in self._lanes[lane].schedule.remaining_actions(self._lanes[lane].step)]
+            running[lane] = RunningPlan(np.reshape(rest, (-1, len(self._low))), 0)
         for lane, chunk in self._predict(running).items():
             self._lanes[lane].schedule.add(chunk, self._lanes[lane].step)
         actions = []
         for state in (self._lanes[lane] for lane in lanes):
-            action, state.info = state.schedule.at(state.step)[-1]
+            action, state.info = state.schedule.actions_at(state.step)[-1]
             state.step += 1
             actions.append(action)
         return np.stack(actions)
 
-    def plan(self, observations: Seen, lanes: Sequence[int] | None = None) -> Array:
+    def plan(self, observations: PolicyInput, lanes: Sequence[int] | None = None) -> Array:
         """Return chunks of actions, (n, k, D) float32, clipped to the spec; the caller executes the first of each.
 
         Without `lanes`, return the chunk (k, D) for the one observation of lane 0. Raises as `act`.
@@ -166,7 +166,7 @@ class Policy:
             return self.plan([self._observation(observations)], [0])[0]
         lane_observations = self._assign_lanes(observations, lanes)
         self._observe(lane_observations)
-        plans = self._predict({lane: observation.running or NOTHING for lane, observation in lane_observations.items()})
+        plans = self._predict({lane: observation.running or NO_PLAN for lane, observation in lane_observations.items()})
         return np.stack([[action for action, _ in plans[lane]] for lane in lanes])
 
     def _observation(self, value: Any) -> Observation:
@@ -194,7 +194,7 @@ class Policy:
             for row, lane in rows.items():
                 self._lanes[lane].frames.append({name: values[row : row + 1] for name, values in features.items()})
 
-    def _predict(self, lanes: Mapping[int, Running]) -> dict[int, list[tuple[Array, dict[str, Any]]]]:
+    def _predict(self, lanes: Mapping[int, RunningPlan]) -> dict[int, list[tuple[Array, dict[str, Any]]]]:
         """Return lane → its chunk of clipped actions, (D,) each, with the `info` of each.
 
         With `chunking`, a chunk begins with the actions of the running plan that are executed before it arrives.
@@ -236,7 +236,7 @@ class Policy:
         with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
             yield
 
-    def _inputs(self, lane: int, running: Running) -> Batch:
+    def _inputs(self, lane: int, running: RunningPlan) -> Batch:
         """Return the input of one prediction, with the next noise and the running plan if the model needs them."""
         inputs, noise = self.window(lane), self.model.sample_noise(self._lanes[lane].random)
         if noise is not None:

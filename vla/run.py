@@ -31,7 +31,7 @@ from vla.config.experiment import Experiment
 from vla.config.packages import config_folders, offer_options, trust
 from vla.deploy import ros
 from vla.io.errors import UserError, suggestion
-from vla.io.printable import printable
+from vla.io.printable import escape
 from vla.parallel.processes import ease_garbage_collection, spin_briefly, without_triton
 
 log = logging.getLogger("vla.run")  # also if this module is __main__
@@ -40,15 +40,20 @@ SWEEP = "in the sweep "  # prefix of a note on a cell's error
 PICKLE = "--experimental-rerun"  # option of Hydra
 OPTIONS = (PICKLE, "--cfg", "--config-dir", "--config-name", "--config-path", "--info", "--package")  # with values
 # Errors of a command line, a file or a machine.
-MENDABLE = (UserError, OSError, HydraException, OmegaConfBaseException, YAMLError, RecursionError)
-CONTINUED = ("collect", "train", "evaluate", "improve")  # jobs that go on where an earlier one ended, in its folder
+EXPECTED_ERRORS = (UserError, OSError, HydraException, OmegaConfBaseException, YAMLError, RecursionError)
+RESUMABLE_JOBS = (
+    "collect",
+    "train",
+    "evaluate",
+    "improve",
+)  # jobs that go on where an earlier one ended, in its folder
 RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")  # variables that Lightning reads on its import
 TRACEBACKS = "VLA_TRACEBACKS"  # environment variable that passes the user's HYDRA_FULL_ERROR to child processes
 
 
 def sentence(error: Exception) -> str:
     """Describe an error in one printable line, with a suggestion where possible."""
-    return printable(" ".join(_describe(error).split()))
+    return escape(" ".join(_describe(error).split()))
 
 
 def _describe(error: Exception) -> str:
@@ -101,7 +106,7 @@ def _is_mendable(error: Exception) -> bool:
     # Lightning's by name, because its import takes seconds; OmegaConf lets the ValueError of a list's key "x" through.
     lightning = type(error).__name__ == "MisconfigurationException"
     of_list = Path(traceback.extract_tb(error.__traceback__)[-1].filename).name == "omegaconf.py"
-    return isinstance(error, MENDABLE) or lightning or of_list
+    return isinstance(error, EXPECTED_ERRORS) or lightning or of_list
 
 
 def _require_sweepable(experiment: Experiment, groups: Container[str]) -> None:
@@ -151,12 +156,12 @@ def _run_job(cfg: DictConfig) -> float | None:
     trust(composed.get("trust"), [composed["job"], *targets(composed)], packages(composed))
     default = compose("config", [f"job={HydraConfig.get().runtime.choices['job']}"])
     cfg = _merge_saved(cfg, overrides)
-    experiment, job = Experiment.of(cfg, default), jobs.find(cfg.job)
+    experiment, job = Experiment.from_config(cfg, default), jobs.find(cfg.job)
     check(experiment, job)
     _require_sweepable(experiment, job.needs(experiment.nodes))
     if jobs.builds_world(experiment) and (replacements := substitutes(experiment["task"], overrides)):
         overrides += replacements
-        experiment = Experiment.of(_merge_saved(compose_again(*overrides), overrides), default)
+        experiment = Experiment.from_config(_merge_saved(compose_again(*overrides), overrides), default)
     return jobs.run(experiment)
 
 
@@ -205,7 +210,7 @@ def _end(error: Exception) -> NoReturn:
             folder = Path(note.removeprefix(SWEEP))
             with warn_on_error(folder):
                 write_table(folder)  # Hydra leaves it to us: see `SweepTable.on_multirun_end`
-            print(printable(f"error: {describe_failures(folder)}"), file=sys.stderr)
+            print(escape(f"error: {describe_failures(folder)}"), file=sys.stderr)
             sys.exit(1)
     if os.environ[TRACEBACKS] == "1" or not _is_mendable(error):
         raise error
@@ -218,7 +223,7 @@ def _say_how_to_continue(cfg: DictConfig) -> None:
 
     Cells of a sweep log nothing: there may be many, each in a process of its own.
     """
-    if HydraConfig.get().mode == RunMode.RUN and cfg.job in CONTINUED:
+    if HydraConfig.get().mode == RunMode.RUN and cfg.job in RESUMABLE_JOBS:
         overrides = HydraConfig.get().overrides
         keys = {override.partition("=")[0] for override in (*overrides.task, *overrides.hydra)}
         has_folder = cfg.job == "collect" or keys & {"output", "resume", "hydra.run.dir"}
@@ -284,7 +289,7 @@ def main() -> None:
     """Run the command line; errors that the user can fix end in one sentence unless HYDRA_FULL_ERROR=1."""
     ease_garbage_collection()
     spin_briefly()
-    sys.excepthook = lambda _, bug, __: sys.stderr.write(printable("".join(traceback.format_exception(bug))))
+    sys.excepthook = lambda _, bug, __: sys.stderr.write(escape("".join(traceback.format_exception(bug))))
     os.environ.setdefault(TRACEBACKS, os.environ.get("HYDRA_FULL_ERROR", "0"))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself
     sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])

@@ -34,7 +34,7 @@ class Schedule(Generic[Action]):
         self._plans: list[Plan[Action]] = []  # in the order in which they were added
 
     @property
-    def newest(self) -> Plan[Action] | None:
+    def newest_plan(self) -> Plan[Action] | None:
         """The plan that was added last."""
         return self._plans[-1] if self._plans else None
 
@@ -51,19 +51,19 @@ class Schedule(Generic[Action]):
         ends = [start + self._period * (place + 1) for place in range(len(actions))]
         self._plans = [*(plan for plan in self._plans if plan.ends[-1] > start), Plan(start, actions, ends)]
 
-    def executed(self, execute: int) -> float:
+    def execution_end(self, execute: int) -> float:
         """Return the time at which the first `execute` actions of the newest plan have ended; -∞ without a plan."""
         return self._plans[-1].start + self._period * execute if self._plans else -math.inf
 
     def wants_plan(self, time: float, execute: int) -> bool:
         """Return whether the first `execute` actions of the newest plan have ended, so that a new plan is due."""
-        return time >= self.executed(execute)
+        return time >= self.execution_end(execute)
 
-    def remaining(self, time: float) -> Sequence[Action]:
+    def remaining_actions(self, time: float) -> Sequence[Action]:
         """Return the actions of the newest plan from a time on."""
         return self._plans[-1].actions[bisect_right(self._plans[-1].ends, time) :] if self._plans else []
 
-    def at(self, time: float) -> list[Action]:
+    def actions_at(self, time: float) -> list[Action]:
         """Return the action of every plan that has one for a time, the newest last."""
         return [plan.actions[bisect_right(plan.ends, time)] for plan in self._plans if time < plan.ends[-1]]
 
@@ -80,6 +80,6 @@ class Delays:
         self._seconds.append(seconds)
 
     @property
-    def longest(self) -> int:
+    def forecast(self) -> int:
         """How many actions will have ended when the next plan arrives."""
         return math.ceil(max(self._seconds, default=0.0) / self._period - 1e-9)

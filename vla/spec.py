@@ -106,25 +106,25 @@ class Spec:
         """Return the indices of state components by name."""
         return [self.state.index(name) for name in names]
 
-    def require_robot(self, what: str) -> RobotModel:
-        """Return the robot; if there is none, a UserError says that `what` needs one."""
+    def require_robot(self, user: str) -> RobotModel:
+        """Return the robot; if there is none, a UserError says that `user` needs one."""
         if self.robot is None:
             raise UserError(
-                f"{what} needs a robot, and the spec of this world has none (robot=None): before training, name its "
+                f"{user} needs a robot, and the spec of this world has none (robot=None): before training, name its "
                 "joints, in the spec of the world's class, or for a recording with task.joints"
             )
         return self.robot
 
-    def require_cut(self, camera: str, shape: Sequence[int], what: str) -> None:
-        """Raise a UserError if the image `what` (H, W, …) may be a whole picture of which `camera` shows a part."""
+    def require_cut(self, camera: str, shape: Sequence[int], image: str) -> None:
+        """Raise a UserError if the `image` (H, W, …) may be a whole picture of which `camera` shows a part."""
         if camera in self.cut and (shape[0], shape[1]) != tuple(self.image_size):
             height, width = self.image_size
             raise UserError(
-                f"{what} has {shape[1]} by {shape[0]} pixels, but {camera} shows a part of a larger picture: give that "
-                f'as "{PICTURE}", or the part in {width} by {height} pixels'
+                f"{image} has {shape[1]} by {shape[0]} pixels, but {camera} shows a part of a larger picture: give "
+                f'that as "{PICTURE}", or the part in {width} by {height} pixels'
             )
 
-    def given(self, names: Container[str]) -> list[str]:
+    def required_images(self, names: Container[str]) -> list[str]:
         """Return the images to provide: all cameras, or, if `names` contains it, `PICTURE` in place of the cut ones."""
         uses_picture = self.parts and PICTURE in names
         return [PICTURE, *(name for name in self.cameras if name not in self.cut)] if uses_picture else [*self.cameras]
@@ -133,7 +133,7 @@ class Spec:
         """Return the height and width [px] at which an image is as detailed as the images in training."""
         if image != PICTURE or not self.parts:
             return self.image_size
-        heights, widths = zip(*(part.whole(self.image_size) for part in self.parts), strict=True)
+        heights, widths = zip(*(part.picture_size(self.image_size) for part in self.parts), strict=True)
         return max(heights), max(widths)
 
     def images(self, observation: Observation) -> Mapping[str, Array]:
@@ -163,8 +163,8 @@ class Spec:
             raise UserError(f"{name} is not valid: {problem}")
         return spec
 
-    def require(self, other: Spec, what: str, against: str) -> None:
-        """Raise a UserError naming the first field in which the spec of `what` (self) differs from `against`.
+    def require(self, other: Spec, owner: str, other_owner: str) -> None:
+        """Raise a UserError naming the first field in which the spec of `owner` (self) differs from `other_owner`.
 
         A chain, home posture or parts that only one of them knows are not a difference.
         """
@@ -173,13 +173,14 @@ class Spec:
             unknown = name in ("robot.chain", "robot.home", "parts") and () in (value, other_fields.get(name))
             if value != other_fields.get(name) and not unknown:
                 raise UserError(
-                    f"{what} has {name} = {str(value)[:200]}, but {against} has {str(other_fields.get(name))[:200]}"
+                    f"{owner} has {name} = {str(value)[:200]}, but {other_owner} has "
+                    f"{str(other_fields.get(name))[:200]}"
                 )
 
-    def require_input(self, other: Spec, what: str, against: str) -> None:
+    def require_input(self, other: Spec, owner: str, other_owner: str) -> None:
         """Like `require`, for the inputs and outputs of a policy: truth and the size of uncut images are ignored."""
         spec, reference = self.without_truth, other.without_truth
-        (spec if self.parts else replace(spec, image_size=reference.image_size)).require(reference, what, against)
+        (spec if self.parts else replace(spec, image_size=reference.image_size)).require(reference, owner, other_owner)
 
 
 def _fields(spec: Spec) -> dict[str, Any]:
@@ -216,7 +217,7 @@ def _contradictions(spec: Spec) -> Iterator[str]:
 
 
 @dataclass(frozen=True)
-class Running:
+class RunningPlan:
     """The rest of the plan that is executed while the next one is computed."""
 
     actions: Array  # (n, D), the first of which begins at the time of the observation
@@ -233,18 +234,18 @@ class Observation:
     # camera → (H, W) uint16 [mm], 0: nothing is there, not even a sky (ROS 16UC1)
     depth: dict[str, Array] = field(default_factory=dict)
     truth: dict[str, Array] | None = None  # simulator only: for experts, never for policies
-    running: Running | None = None  # for policies that continue it
+    running: RunningPlan | None = None  # for policies that continue it
 
-    def require_truth(self, who: str) -> dict[str, Array]:
-        """Return the truth; if there is none, a UserError says that `who` needs it."""
+    def require_truth(self, user: str) -> dict[str, Array]:
+        """Return the truth; if there is none, a UserError says that `user` needs it."""
         if self.truth is None:
-            raise UserError(f"{who} needs the simulator's truth, which this observation lacks")
+            raise UserError(f"{user} needs the simulator's truth, which this observation lacks")
         return self.truth
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], spec: Spec) -> Observation:
         """Convert a gymnasium observation: images by camera, "state", "instruction"; a UserError if one is missing."""
-        cameras = spec.given(values)
+        cameras = spec.required_images(values)
         if missing_keys := [name for name in (*cameras, "state", "instruction") if name not in values]:
             raise UserError(f"the observation has {', '.join(map(str, values))}, but lacks {', '.join(missing_keys)}")
         rgb = {camera: values[camera] for camera in cameras}

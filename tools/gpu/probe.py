@@ -118,7 +118,7 @@ def latency(file: Path, demonstrations: str, episodes: str, plans: str, compiled
     store, rows = EpisodeStore(Path(demonstrations), int(episodes)), dict[str, Any]()
     for name in models:
         config = compose("job=train", *f"model={name}".split(","), f"collect.folder={demonstrations}", "output=unused")
-        model = Experiment.of(config).fitted_learner(store).model
+        model = Experiment.from_config(config).fitted_learner(store).model
         for precision in ("fp32", "bf16")[: 1 + torch.cuda.is_available()]:
             for graphs in (False, True)[: 1 + (compiled == "True")]:
                 row = _result_of(partial(_times, model, precision, graphs, int(plans)))

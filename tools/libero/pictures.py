@@ -56,7 +56,9 @@ def main() -> None:
     options = [argument for argument in sys.argv[1:] if "=" in argument]
     sheet, *names = [argument for argument in sys.argv[1:] if argument not in options] or [None]
     original, rows, differences = Original(), [], []
-    with closing(Experiment.of(compose("task=libero", "output=none", *options)).make_environment()()) as environment:
+    with closing(
+        Experiment.from_config(compose("task=libero", "output=none", *options)).make_environment()()
+    ) as environment:
         assert isinstance(environment, Libero)
         if unknown := {*names} - {*environment.tasks}:
             raise SystemExit(f"there are no tasks {', '.join(map(str, unknown))}; there is {environment.tasks[0]}")

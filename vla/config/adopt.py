@@ -17,8 +17,8 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from vla.config.build import GROUPS, require_no_paths, require_trust, without_paths
-from vla.config.differences import ABSENT, at, differences
-from vla.io.documents import read_yaml, resolved
+from vla.config.differences import ABSENT, differences, value_at
+from vla.io.documents import read_yaml, resolve_config
 from vla.io.errors import UserError
 from vla.models.checkpoint import read_header
 from vla.models.policy_folder import POLICY, REQUIRED_NODES, read_policy
@@ -26,12 +26,12 @@ from vla.models.trunk_folder import is_trunk
 
 log = logging.getLogger(__name__)
 
-LAST = Path("checkpoints/last.ckpt")  # in the folder of a training
+LAST_CHECKPOINT = Path("checkpoints/last.ckpt")  # in the folder of a training
 # How a policy was trained, besides task, tokenizer and model: rounds of DAgger keep these, and reports show them.
-OF_TRAINING = ("expert", "data", "learner", "validate", "collect.episodes", "collect.seed")
+TRAINING_KEYS = ("expert", "data", "learner", "validate", "collect.episodes", "collect.seed")
 SCHEDULE = ("val_check_interval", "accumulate_grad_batches", "gradient_clip_val", "precision")  # of the trainer
-REPORTED = (*OF_TRAINING, "seed", "trainer.max_steps", *(f"trainer.{name}" for name in SCHEDULE))
-OVER = ("seed", "data", "learner", "trainer", "logger", "validate")  # keys that do not change a trained policy
+REPORTED_KEYS = (*TRAINING_KEYS, "seed", "trainer.max_steps", *(f"trainer.{name}" for name in SCHEDULE))
+NEUTRAL_KEYS = ("seed", "data", "learner", "trainer", "logger", "validate")  # keys that do not change a trained policy
 MACHINES = ("accelerator", "devices", "num_nodes", "strategy")  # keys that trainer=OPTION changes in a resumed run
 # A resumed run with other values of these keys would be a different training.
 IDENTITY = (
@@ -52,11 +52,11 @@ def adopt(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     require_no_paths(saved_config, REQUIRED_NODES, cfg.checkpoint, _replaced_paths(parsed))
     values = _values(saved_config, REQUIRED_NODES)
     if cfg.job == "evaluate":
-        if ignored := [override for override in parsed if _path(override).partition(".")[0] in OVER]:
+        if ignored := [override for override in parsed if _path(override).partition(".")[0] in NEUTRAL_KEYS]:
             text = "ignored: %s, because checkpoint= evaluates a policy as it is; pretrained= trains it further"
             log.warning(text, ", ".join(str(override.input_line) for override in ignored))
         parsed = [override for override in parsed if override not in ignored]  # a report shows the training as it was
-        values |= _values(saved_config, REPORTED)
+        values |= _values(saved_config, REPORTED_KEYS)
         # The only one of them that is ever built, in an open-loop evaluation.
         values |= {"expert": without_paths(saved_config, "expert")} if "expert" in saved_config else {}
     return _merge(cfg, values | _chosen_options(saved_config, "experiment", "model"), parsed)
@@ -78,7 +78,7 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
         return _with_trunk(cfg)
     saved_config, in_rounds = read_policy(cfg.pretrained).config, cfg.job == "improve"  # first, to report a wrong path
     parsed = _parse(overrides, ("tokenizer", "model", "experiment"))
-    parts = (*REQUIRED_NODES, *OF_TRAINING) if in_rounds else ("tokenizer", "model", "data")
+    parts = (*REQUIRED_NODES, *TRAINING_KEYS) if in_rounds else ("tokenizer", "model", "data")
     require_no_paths(saved_config, parts, cfg.pretrained, _replaced_paths(parsed) if in_rounds else None)
     values = _values(saved_config, parts)
     if "seed" in values.get("data", {}):
@@ -136,32 +136,35 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
 
 def _read_config(run: Path) -> tuple[Path, Mapping[str, Any]]:
     """Return the file with the config of a run, its last checkpoint or config.yaml for rounds, and that config."""
-    if (run / LAST).is_file():
-        return run / LAST, read_header(run / LAST).config
+    if (run / LAST_CHECKPOINT).is_file():
+        return run / LAST_CHECKPOINT, read_header(run / LAST_CHECKPOINT).config
     file = run / "config.yaml"
     if file.is_file() and (config := read_yaml(file, dict[str, Any])).get("job") == "improve":
-        return file, resolved(config, str(file))
-    raise UserError(f"resume={run} has no training to continue: there is no {run / LAST}")
+        return file, resolve_config(config, str(file))
+    raise UserError(f"resume={run} has no training to continue: there is no {run / LAST_CHECKPOINT}")
 
 
 def _values(config: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
     """Return dotted key → saved value, without keys that the saved config lacks."""
-    return {key: value for key in keys if (value := at(config, key)) != ABSENT}
+    return {key: value for key in keys if (value := value_at(config, key)) != ABSENT}
 
 
 def _chosen_options(config: Mapping[str, Any], *groups: str) -> dict[str, Any]:
-    return {f"chosen.{group}": at(config, f"chosen.{group}", None) for group in groups}
+    return {f"chosen.{group}": value_at(config, f"chosen.{group}", None) for group in groups}
 
 
 def require_identity(
-    saved: Mapping[str, Any], config: Mapping[str, Any], folder: Path, further: Sequence[str] = ()
+    saved_config: Mapping[str, Any], config: Mapping[str, Any], folder: Path, further_keys: Sequence[str] = ()
 ) -> None:
-    """Raise a UserError unless `config` describes the training in a run's `folder`, which has the config `saved`.
+    """Raise a UserError unless `config` describes the training in a run's `folder`, whose config is `saved_config`.
 
-    The dotted keys of `IDENTITY`, and `further` ones, must have equal values.
+    The dotted keys of `IDENTITY`, and `further_keys`, must have equal values.
     """
     defaults = {"trainer.num_nodes": 1}  # the default of trainers that omit it
-    old, new = ({key: at(node, key, defaults.get(key)) for key in (*IDENTITY, *further)} for node in (saved, config))
+    old, new = (
+        {key: value_at(node, key, defaults.get(key)) for key in (*IDENTITY, *further_keys)}
+        for node in (saved_config, config)
+    )
     keys = [key for key, _, _ in differences(old, new)]
     if keys:
         weights = f"; pretrained={folder} starts another from its weights" if (folder / POLICY).exists() else ""

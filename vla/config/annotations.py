@@ -29,7 +29,7 @@ from vla.io.errors import UserError, suggestion
 
 # Configs also come from policies and stores of other people. A `_target_` may name a class of this package, one of
 # those that `conf/` uses, or one that the user trusts.
-OWN = "vla."
+OWN_PREFIX = "vla."
 LIBRARY = (
     "lightning.Trainer",
     "lightning.pytorch.loggers.CSVLogger",
@@ -52,9 +52,9 @@ class MissingLibrary(UserError):
 def locate(key: str, target: Any) -> type:
     """Import the class that the `_target_` at `key` names; raise a UserError if it is not allowed or does not exist."""
     require_trusted(key, target)
-    if not isinstance(target, str) or not (target.startswith(OWN) or target in LIBRARY or is_trusted(target)):
+    if not isinstance(target, str) or not (target.startswith(OWN_PREFIX) or target in LIBRARY or is_trusted(target)):
         raise UserError(
-            f"{key} must name a class of {OWN.rstrip('.')}, of a package that trust=[…] names, or one of "
+            f"{key} must name a class of {OWN_PREFIX.rstrip('.')}, of a package that trust=[…] names, or one of "
             f"{', '.join(LIBRARY)}, got {target!r}"
         )
     module, _, name = target.rpartition(".")
@@ -62,17 +62,20 @@ def locate(key: str, target: Any) -> type:
     try:
         attribute = getattr(import_module(module), name)
     except (ImportError, AttributeError) as error:
-        place = "" if target.startswith(OWN) else f" on {gethostname()}, where {package} must be installed"
+        place = "" if target.startswith(OWN_PREFIX) else f" on {gethostname()}, where {package} must be installed"
         library = isinstance(error, ModuleNotFoundError) and not f"{error.name}.".startswith(f"{package}.")
-        kind, hint = (MissingLibrary, how_to_install(str(error.name))) if library else (UserError, "")
+        kind, hint = (MissingLibrary, install_hint(str(error.name))) if library else (UserError, "")
         raise kind(f"{key} is {target}, which cannot be imported{place}: {error}{hint}") from error
     # A module's attributes include its imports, such as `os`.
-    if not isinstance(attribute, type) or attribute.__module__.partition(".")[0] not in (OWN.rstrip("."), package):
+    if not isinstance(attribute, type) or attribute.__module__.partition(".")[0] not in (
+        OWN_PREFIX.rstrip("."),
+        package,
+    ):
         raise UserError(f"{key} must name a class that is defined in {package}, got {target!r}")
     return attribute
 
 
-def how_to_install(module: str) -> str:
+def install_hint(module: str) -> str:
     """Return a hint on how to install the extra of this package that provides a module; "" if none does."""
     try:
         requirements = requires("vla") or []
@@ -84,15 +87,15 @@ def how_to_install(module: str) -> str:
     return f"; install vla with its extra {extra}: pip install -e '.[{extra}]'" if extra else ""
 
 
-def require_trusted(source: object, target: Any, imported: bool = False) -> None:
+def require_trusted(source: object, target: Any, is_package: bool = False) -> None:
     """Raise a UserError if `target`, named by `source`, belongs to a package that can be trusted but is not.
 
-    `imported`: `target` is itself the name of a package to import.
+    `is_package`: `target` is itself the name of a package to import.
     """
-    if not isinstance(target, str) or target.startswith(OWN) or target in LIBRARY or is_trusted(target):
+    if not isinstance(target, str) or target.startswith(OWN_PREFIX) or target in LIBRARY or is_trusted(target):
         return
     package, dot, _ = target.partition(".")
-    if imported or (dot and can_be_trusted(package)):
+    if is_package or (dot and can_be_trusted(package)):
         raise UserError(f"{source} names {target}, which is not trusted: add trust=[{package}] if you trust its source")
 
 
@@ -111,17 +114,17 @@ def packages(value: Any) -> list[Any]:
     return [part["package"] for part in mappings(value) if is_node(part) and "package" in part]
 
 
-def fits(found: type, expected: Any) -> bool:
-    """Return whether the class `found` satisfies `expected`, a class, a union or a protocol."""
+def fits(candidate: type, expected: Any) -> bool:
+    """Return whether the class `candidate` satisfies `expected`, a class, a union or a protocol."""
     if get_origin(expected) in (Union, types.UnionType):
-        return any(fits(found, alternative) for alternative in get_args(expected))
+        return any(fits(candidate, alternative) for alternative in get_args(expected))
     expected = get_origin(expected) or expected
     if not isinstance(expected, type):
         return False
     if getattr(expected, "_is_protocol", False):
         methods = {name for name, member in vars(expected).items() if inspect.isfunction(member)}
-        return all(any(name in vars(base) for base in found.__mro__) for name in methods - IN_EVERY_PROTOCOL)
-    return issubclass(found, expected)
+        return all(any(name in vars(base) for base in candidate.__mro__) for name in methods - IN_EVERY_PROTOCOL)
+    return issubclass(candidate, expected)
 
 
 def takes_path(annotation: Any) -> bool:
@@ -142,7 +145,7 @@ def mismatch(key: str, value: Any, annotation: Any) -> str:
     reasons = dict.fromkeys(detail["msg"] for detail in errors if _part_at(value, detail["loc"])[0] == path)
     words = [re.sub(r"^\w+ should (be )?| after validation.*", "", text).replace("None", "null") for text in reasons]
     verb = "must" if words[0].startswith(("have ", "match ")) else "must be"
-    sentence = f"{key}{path} {verb} {' or '.join(words)}, got {short(part)}"
+    sentence = f"{key}{path} {verb} {' or '.join(words)}, got {format_short(part)}"
     if isinstance(part, str) and any(detail["type"] == "node" for detail in errors):
         return f"{sentence}: an option is chosen with a slash, {f'{key}{path}'.replace('.', '/')}={part}"
     choices = [str(choice) for choice in get_args(annotation)] if get_origin(annotation) is Literal else []
@@ -160,7 +163,7 @@ def _part_at(value: Any, location: Sequence[int | str]) -> tuple[str, Any]:
     return path, value
 
 
-def short(value: Any) -> str:
+def format_short(value: Any) -> str:
     """Format a plain value in at most 200 characters."""
     text = json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
     return text if len(text) <= 200 else f"{text[:200]}…"

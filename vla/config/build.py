@@ -24,18 +24,18 @@ from hydra.utils import instantiate
 from vla.config.annotations import (
     MissingLibrary,
     fits,
-    how_to_install,
+    format_short,
+    install_hint,
     is_node,
     locate,
     mismatch,
     packages,
     require_trusted,
-    short,
     takes_path,
     targets,
 )
 from vla.config.packages import MISSING
-from vla.io.documents import resolved
+from vla.io.documents import resolve_config
 from vla.io.errors import UserError, suggestion
 from vla.io.types import Count, Inherited, Natural, NonNegative, Share
 
@@ -57,7 +57,7 @@ class Group:
 
 
 DEMONSTRATIONS = "vla.data.formats.imported_demonstrations.ImportedDemonstrations"
-OF_DATA = ("folder", "spec", "history", "chunk", "tokenize", "episodes", "more")
+DATA_ARGUMENTS = ("folder", "spec", "history", "chunk", "tokenize", "episodes", "more")
 LOGGER = "lightning.pytorch.loggers.Logger"
 TOKENIZER = "vla.models.tokenizers.tokenizer.ActionTokenizer"
 
@@ -71,7 +71,7 @@ GROUPS = {
         Group("task", ("vla.spec.Environment", "vla.spec.SpecOnly"), training="part"),
         Group("expert", ("vla.spec.Agent", DEMONSTRATIONS), ("spec",), training="part"),
         Group("cluster", ("vla.parallel.pool.Cluster",), training="means"),
-        Group("data", ("vla.data.datamodule.WindowDataModule",), OF_DATA, training="part"),
+        Group("data", ("vla.data.datamodule.WindowDataModule",), DATA_ARGUMENTS, training="part"),
         Group("tokenizer", (TOKENIZER,), ("spec", "statistics"), training="part"),
         Group("model", ("vla.models.model.Model",), ("spec", "tokenizer"), training="part"),
         Group("learner", ("vla.models.learner.Learner",), ("model", "spec", "config"), training="part"),
@@ -95,7 +95,7 @@ def device_list(text: str) -> bool:
 
 # Narrower than Lightning's annotations: with other values its trainer fails late, or silently trains nothing.
 Devices = Annotated[list[Natural], MinLen(1)] | Annotated[str, Predicate(device_list)]
-NARROWER: dict[str, dict[str, Any]] = {
+NARROWER_TYPES: dict[str, dict[str, Any]] = {
     "lightning.Trainer": {
         "max_steps": Literal[-1] | Count,
         "max_epochs": Literal[-1],  # an epoch never ends
@@ -122,14 +122,14 @@ def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
     constructor, or a library that is not installed.
     """
     group = GROUPS[group] if isinstance(group, str) else group
-    node = resolved(node, group.name)
-    check_node(group.name, node, makes(group), tuple(runtime))
+    node = resolve_config(node, group.name)
+    check_node(group.name, node, product_type(group), tuple(runtime))
     try:
         return instantiate(node, _convert_="all", _partial_=True, _recursive_=not group.plain)(**runtime)
     except (InstantiationException, ModuleNotFoundError) as error:
         cause = error.__cause__ if isinstance(error, InstantiationException) else error  # in a nested node, or this one
         if isinstance(cause, ModuleNotFoundError):
-            hint = how_to_install(str(cause.name))
+            hint = install_hint(str(cause.name))
             raise UserError(f"{group.name} needs a library that is not installed: {cause}{hint}") from error
         if isinstance(cause, ValueError):
             raise UserError(str(cause)) from error
@@ -137,7 +137,7 @@ def build(node: Mapping[str, Any], group: str | Group, **runtime: Any) -> Any:
 
 
 @cache
-def makes(group: Group) -> Any:
+def product_type(group: Group) -> Any:
     """Return the class, protocol or union of the objects that a group describes."""
     classes = [getattr(import_module(module), name) for module, _, name in (p.rpartition(".") for p in group.makes)]
     return reduce(or_, classes)
@@ -151,7 +151,7 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
     `expected` one, or a key is unknown, missing or ill-typed, with its dotted name and the allowed values.
     """
     if not is_node(node):
-        raise UserError(f"{key} must be a node with a _target_, got {short(node)}")
+        raise UserError(f"{key} must be a node with a _target_, got {format_short(node)}")
     partial = node.get("_partial_", False)
     if not isinstance(partial, bool) or (partial and expected is not object):
         raise UserError(f"{key}._partial_ must be {'true or false' if expected is object else 'omitted here'}")
@@ -161,7 +161,7 @@ def check_node(key: str, node: Any, expected: Any, runtime: Sequence[str] = ()) 
         raise UserError(f"{key}._target_ must name a class of kind {kind}, got {node['_target_']}")
     _check_arguments(key, node, target, runtime, partial)
     if "package" in node:
-        require_trusted(key, node["package"], imported=True)
+        require_trusted(key, node["package"], is_package=True)
 
 
 def _check_arguments(key: str, node: Mapping[str, Any], target: type, runtime: Sequence[str], partial: bool) -> None:
@@ -173,7 +173,7 @@ def _check_arguments(key: str, node: Mapping[str, Any], target: type, runtime: S
     if missing := [name for name in runtime if not variadic and name not in parameters]:
         raise UserError(f"{key}: {target.__name__} must take the arguments {', '.join(missing)}, which the job gives")
     hints = {name: parameter.annotation for name, parameter in parameters.items()}
-    hints |= NARROWER.get(node["_target_"], {})
+    hints |= NARROWER_TYPES.get(node["_target_"], {})
     prefix = f"{key}." if key else ""
     for name, value in values.items():
         if not variadic or str(name).startswith("_"):
@@ -193,23 +193,23 @@ def require_trust(config: Mapping[str, Any], names: Iterable[Any], source: objec
     for target in targets(nodes):
         require_trusted(source, target)
     for package in packages(nodes):
-        require_trusted(source, package, imported=True)
+        require_trusted(source, package, is_package=True)
 
 
 def require_no_paths(
-    config: Mapping[str, Any], names: Collection[str], source: object, given: Collection[str] | None = None
+    config: Mapping[str, Any], names: Collection[str], source: object, replaced_nodes: Collection[str] | None = None
 ) -> None:
     """Raise a UserError if a node of the file `source` names a file, a folder, or an address or key of a connection.
 
     Args:
         config: plain; the classes of its nodes `names`, where present, must be trusted.
         source: named in the error.
-        given: dotted names of nodes that the command line replaces; None: it cannot replace any.
+        replaced_nodes: dotted names of nodes that the command line replaces; None: it cannot replace any.
     """
     require_trust(config, names, source)
     for key in (f"{path}.{argument}" for name in names for _, path, argument in _paths_in(config.get(name), name)):
-        if not any(f"{key}.".startswith(f"{name}.") for name in given or ()):
-            hint = "" if given is None else f"; {key.rpartition('.')[0].replace('.', '/')}=OPTION gives yours"
+        if not any(f"{key}.".startswith(f"{name}.") for name in replaced_nodes or ()):
+            hint = "" if replaced_nodes is None else f"; {key.rpartition('.')[0].replace('.', '/')}=OPTION gives yours"
             raise UserError(
                 f"{source} names a path or an address in {key}: such values are taken from your command line only{hint}"
             )
@@ -220,7 +220,7 @@ def without_paths(config: Mapping[str, Any], name: str) -> Any:
 
     If it has a class that may not be built, only its own `_target_` is returned.
     """
-    node = resolved(config[name], name)  # a copy
+    node = resolve_config(config[name], name)  # a copy
     try:
         require_trust(config, [name], name)
         for part, _, argument in list(_paths_in(node, name)):
@@ -268,10 +268,10 @@ def _check_nodes(key: str, value: Any) -> None:
     return None
 
 
-def require_known(key: str, name: str, known: Collection[str], owner: str) -> None:
+def require_known(key: str, name: str, names: Collection[str], owner: str) -> None:
     """Raise a UserError for a name that `owner` does not take; it suggests a similar name, or lists all."""
-    if name not in known:
-        hint = suggestion(name, known) or f": {owner} takes {', '.join(known) or 'no arguments'}"
+    if name not in names:
+        hint = suggestion(name, names) or f": {owner} takes {', '.join(names) or 'no arguments'}"
         raise UserError(f"{f'{key}.' if key else ''}{name} is unknown{hint}")
 
 

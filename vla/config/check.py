@@ -9,8 +9,8 @@ from inspect import Parameter
 from typing import Any
 
 from vla.config.annotations import MissingLibrary, fits, locate
-from vla.config.build import GROUPS, Group, arguments, check_node, makes, require_known
-from vla.config.differences import ABSENT, at
+from vla.config.build import GROUPS, Group, arguments, check_node, product_type, require_known
+from vla.config.differences import ABSENT, value_at
 from vla.config.experiment import Experiment
 from vla.config.nodes import Evaluation, Rounds, Settings, Validation, with_changes
 from vla.config.packages import config_folders
@@ -20,7 +20,7 @@ from vla.io.errors import UserError
 OF_EVERY_JOB = ("collect", "validate", "evaluate")
 TRAINING = tuple(group.name for group in GROUPS.values() if group.training)
 # Keys that trainings read, though Lightning has defaults for them.
-NEEDED = {"trainer": ("max_steps", "precision", "accumulate_grad_batches", "val_check_interval")}
+REQUIRED_KEYS = {"trainer": ("max_steps", "precision", "accumulate_grad_batches", "val_check_interval")}
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def _check(experiment: Experiment, job: Job) -> None:
     for name, group in groups.items():
         if config.get(name) is not None:
             _check_group(config[name], group, may_lack=name in job.stored)
-            if missing_keys := [key for key in NEEDED.get(name, ()) if key not in config[name]]:
+            if missing_keys := [key for key in REQUIRED_KEYS.get(name, ()) if key not in config[name]]:
                 raise UserError(f"{name}.{missing_keys[0]} is missing: trainings need it")
         elif not group.optional:
             raise UserError(f"job={settings.job} needs {name}=OPTION; --help lists the options")
@@ -96,11 +96,11 @@ def _check(experiment: Experiment, job: Job) -> None:
 
 def _experiment_hint(config: Mapping[str, Any], error: str) -> str:
     """Return how to override the chosen experiment at the key that an error begins with; "" if it does not set that."""
-    name, key = at(config, "chosen.experiment"), error.partition(" ")[0]
+    name, key = value_at(config, "chosen.experiment"), error.partition(" ")[0]
     if "." not in key or config.get("checkpoint") is not None:  # which has an experiment of its own
         return ""
     for content in _experiments(str(name)):
-        if at(content, key) not in (ABSENT, {}) and at(content, key) == at(config, key):
+        if value_at(content, key) not in (ABSENT, {}) and value_at(content, key) == value_at(config, key):
             way_out = f"~{key} removes it" if f"{key} is unknown" in error else f"{key}=VALUE replaces it"
             return f"experiment={name} sets it: {way_out}"
     return ""
@@ -123,7 +123,7 @@ def _check_group(node: Any, group: Group, may_lack: bool) -> None:
     nodes = {f"{group.name}.{key}": part for key, part in node.items()} if group.several else {group.name: node}
     for key, child in nodes.items():
         with suppress(MissingLibrary) if may_lack else nullcontext():
-            check_node(key, child, makes(group), group.runtime)
+            check_node(key, child, product_type(group), group.runtime)
 
 
 def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None:
@@ -140,7 +140,7 @@ def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None
         conditions["improve.changes"] = experiment.options(Rounds).changes
     for name, changes in conditions.items():
         if changes:
-            check_node(f"task ({name})", with_changes(experiment["task"], changes), makes(GROUPS["task"]))
+            check_node(f"task ({name})", with_changes(experiment["task"], changes), product_type(GROUPS["task"]))
 
 
 def devices(trainer: Mapping[str, Any]) -> int:

@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 import vla.config.resolvers  # noqa: F401  registers them
 from vla.config.annotations import is_node, locate
 from vla.config.build import check_value
-from vla.config.experiment import Node, plain
+from vla.config.experiment import Node, to_plain
 from vla.config.packages import CONF, offer_options
 from vla.io.documents import read_yaml
 from vla.io.errors import UserError, suggestion
@@ -59,7 +59,7 @@ def with_variant(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
     if name not in variants:
         hint = f"{suggestion(str(name), variants) or ':'} the variants are {', '.join(variants)}" if variants else ""
         raise UserError(f"there is no variant={name}{hint or ': choose an experiment that has it'}")
-    changes = plain(variants)[name]
+    changes = to_plain(variants)[name]
     check_value(f"variants.{name}", changes, list[str])
     overrides_by_key = {override.partition("=")[0]: override for override in overrides}
     for change in changes:
@@ -88,7 +88,7 @@ def compose_task(task: str, **overrides: Any) -> Node:
                 plain_value = json.loads(json.dumps(value))  # tuples as lists
                 key, is_new = name.removeprefix("+"), name.startswith("+")
                 OmegaConf.update(config.task, key, plain_value, merge=True, force_add=is_new)
-        return plain(config.task)
+        return to_plain(config.task)
 
 
 @cache

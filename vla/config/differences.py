@@ -6,21 +6,21 @@ from collections.abc import Mapping
 from typing import Any
 
 # Keys that do not change the result of a run.
-NOT_COMPARED = ("output", "cluster", "job", "resume", "trust", "export")
+IGNORED_KEYS = ("output", "cluster", "job", "resume", "trust", "export")
 ABSENT = "-"  # value of a key that one of two configs lacks
 
 
-def at(config: Any, key: str, absent: Any = ABSENT) -> Any:
-    """Return the value of a plain config at a dotted key, or `absent`."""
+def value_at(config: Any, key: str, default: Any = ABSENT) -> Any:
+    """Return the value of a plain config at a dotted key, or `default`."""
     for name in key.split("."):
         if not isinstance(config, Mapping) or name not in config:
-            return absent
+            return default
         config = config[name]
     return config
 
 
 def differences(one: Any, other: Any, key: str = "") -> list[tuple[str, Any, Any]]:
-    """Return dotted key and both values of every difference between two plain configs, except `NOT_COMPARED`.
+    """Return dotted key and both values of every difference between two plain configs, except `IGNORED_KEYS`.
 
     A node that only one config has is one entry, with `ABSENT` for the other; top-level ones, of jobs, are left out.
     """
@@ -28,7 +28,7 @@ def differences(one: Any, other: Any, key: str = "") -> list[tuple[str, Any, Any
         return [] if one == other else [(key, one, other)]
     entries = []
     for name in dict.fromkeys((*one, *other)):
-        if key or (name in one and name in other and name not in NOT_COMPARED):
+        if key or (name in one and name in other and name not in IGNORED_KEYS):
             values = one.get(name, ABSENT), other.get(name, ABSENT)
             entries += differences(*values, f"{key}.{name}" if key else str(name))
     return entries

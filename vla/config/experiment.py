@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from vla.config.annotations import locate
 from vla.config.build import GROUPS, Group, build, require_no_paths
-from vla.config.differences import ABSENT, at, differences
+from vla.config.differences import ABSENT, differences, value_at
 from vla.config.nodes import Collection, Evaluation, Settings, Validation, with_changes
 from vla.config.origin import SECRET, Origin, find_origin
 from vla.io.errors import UserError
@@ -46,12 +46,12 @@ class Experiment:
     changes: list[Node] = field(default_factory=list)  # differences from the default config, to show
 
     @classmethod
-    def of(cls, cfg: DictConfig, default: DictConfig | None = None) -> Experiment:
+    def from_config(cls, cfg: DictConfig, default: DictConfig | None = None) -> Experiment:
         """Create the experiment of a composed config; `default` is the config without overrides."""
-        nodes = {group.name: None for group in GROUPS.values() if group.optional} | plain(cfg)
+        nodes = {group.name: None for group in GROUPS.values() if group.optional} | to_plain(cfg)
         if default is None:
             return cls(nodes)
-        default_nodes, changes = plain(default), []
+        default_nodes, changes = to_plain(default), []
         # Unresolved, so that a value is one difference and not one in each place that refers to it.
         unresolved, default_unresolved = (OmegaConf.to_container(config, resolve=False) for config in (cfg, default))
         for key, raw, default_raw in differences(unresolved, default_unresolved):
@@ -59,9 +59,9 @@ class Experiment:
                 continue
             if raw == ABSENT and _class_differs(key, nodes, default_nodes):  # a setting of the default's class
                 continue
-            value, standard = at(nodes, key), at(default_nodes, key)
+            value, standard = value_at(nodes, key), value_at(default_nodes, key)
             if value != standard or value == ABSENT:  # else a reference and a literal have the same value
-                own_value, default_value = at(nodes, key, raw), at(default_nodes, key, default_raw)
+                own_value, default_value = value_at(nodes, key, raw), value_at(default_nodes, key, default_raw)
                 changes.append({"key": key, "here": own_value, "default": default_value})
         return cls(nodes, _without_secrets(changes))
 
@@ -167,7 +167,7 @@ class Experiment:
         checkpoint = checkpoint or self.checkpoint
         if checkpoint is None:
             raise UserError("this job needs a trained policy: add checkpoint=RUN")
-        return partial(make_policy, self.nodes["policy"], checkpoint, own=True)
+        return partial(make_policy, self.nodes["policy"], checkpoint, is_own=True)
 
     def make_recorder(self, folder: Path) -> Callable[[], Recorder] | None:
         """Return the factory of the recorder that writes into a folder, or None without a recorder."""
@@ -188,7 +188,7 @@ class Experiment:
         """Folder of the policy that initialises a training, if given; raises a UserError if there is none."""
         return _policy_folder(self.settings.pretrained)
 
-    def learner(self, spec: Spec, origin: Path | None = None, last: Path | None = None) -> Learner:
+    def learner(self, spec: Spec, origin: Path | None = None, last_checkpoint: Path | None = None) -> Learner:
         """Build the learner with initial weights; without any, the caller must then call `fit_tokenizer`.
 
         Raises a UserError if the policy or checkpoint is damaged, or the policy has another spec.
@@ -196,18 +196,23 @@ class Experiment:
         Args:
             spec: of the demonstrations.
             origin: folder of the policy that has the weights.
-            last: Lightning's checkpoint of this training, which is to continue.
+            last_checkpoint: Lightning's checkpoint of this training, which is to continue.
         """
         from vla.models.checkpoint import read_content, weights_of
         from vla.models.policy_folder import read_policy
         from vla.models.trunk import Source
 
-        saved, content = read_policy(origin) if origin else None, read_content(last) if last else None
+        saved, content = (
+            read_policy(origin) if origin else None,
+            read_content(last_checkpoint) if last_checkpoint else None,
+        )
         if saved:
             saved.spec.require_input(spec, f"the policy {origin}", "the demonstrations")
-        initial_spec = saved.spec if saved else Spec.from_dict(content["spec"], str(last)) if content else spec
+        initial_spec = (
+            saved.spec if saved else Spec.from_dict(content["spec"], str(last_checkpoint)) if content else spec
+        )
         spec = replace(spec, robot=initial_spec.robot, image_size=initial_spec.image_size)
-        model = _model(self.nodes, spec, saved, weights=bool(origin or last))
+        model = _model(self.nodes, spec, saved, weights=bool(origin or last_checkpoint))
         if saved:
             saved.initialize(model)
         for name, source in content.get("trunks", {}).items() if content else ():
@@ -249,7 +254,7 @@ class Experiment:
 def _class_differs(key: str, nodes: Node, default_nodes: Node) -> bool:
     """Return whether the node that contains a dotted key has different classes in two configs."""
     target = f"{key.rpartition('.')[0]}._target_"
-    return at(nodes, target) != at(default_nodes, target)
+    return value_at(nodes, target) != value_at(default_nodes, target)
 
 
 def _without_secrets(values: Any) -> Any:
@@ -258,7 +263,7 @@ def _without_secrets(values: Any) -> Any:
     return [_without_secrets(value) for value in values] if isinstance(values, list) else values
 
 
-def plain(node: DictConfig) -> Node:
+def to_plain(node: DictConfig) -> Node:
     """Convert a composed node to dicts and lists."""
     container = OmegaConf.to_container(node, resolve=True)
     assert isinstance(container, dict)
@@ -286,7 +291,9 @@ def make_agent(node: Node, group: str, environment: Environment) -> Agent:
     return agent
 
 
-def make_policy(policy: Node, checkpoint: Path, environment: Environment | None = None, *, own: bool = False) -> Policy:
+def make_policy(
+    policy: Node, checkpoint: Path, environment: Environment | None = None, *, is_own: bool = False
+) -> Policy:
     """Build the policy in a folder with the options of a policy node.
 
     Raises a UserError without a policy, if its spec does not fit, or if it names a path, address or untrusted class.
@@ -295,14 +302,14 @@ def make_policy(policy: Node, checkpoint: Path, environment: Environment | None 
         policy: the node.
         checkpoint: the folder.
         environment: in which the policy is to act.
-        own: the policy may name paths and addresses, because it is of this run, or was checked before.
+        is_own: the policy may name paths and addresses, because it is of this run, or was checked before.
     """
     from vla.models.policy_folder import read_policy
 
     saved = read_policy(checkpoint)
     if environment is not None:
         saved.spec.require_input(environment.spec, f"the policy {checkpoint}", "the task")
-    if not own:
+    if not is_own:
         require_no_paths({**saved.config, "model": _model_node(saved.config, saved, weights=True)}, PARTS, checkpoint)
     model = _model(saved.config, saved.spec, saved, weights=True)
     saved.restore(model)

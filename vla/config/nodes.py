@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Changes = dict[str, object]  # overrides of the task node
 UnseenSeed = Annotated[Seed, Ge(FIRST_SEED)]
-Between = Annotated[float, Gt(0), Lt(1)]
+OpenShare = Annotated[float, Gt(0), Lt(1)]
 
 NEAREST = "nearest"  # condition of an evaluation in which a demonstration is replayed
 
@@ -84,9 +84,9 @@ class Evaluation:
     episodes: Count  # with `until`, at most
     seed: UnseenSeed  # of the first episode
     until: Literal["decided"] | None  # stop as soon as `bar`, `against` and the differences of conditions are decided
-    bar: Between | None  # success rate to compare with
+    bar: OpenShare | None  # success rate to compare with
     against: Text | None  # run to compare with on the same episodes
-    margin: Between  # loss of success that counts as not worse
+    margin: OpenShare  # loss of success that counts as not worse
     recordings: Literal["all", "failures"] | Natural  # episodes to record; failures: also ten successes
     conditions: dict[str, Changes]  # name → overrides of the task
     one_by_one: dict[str, dict[str, Changes]]  # level → overrides of the task, each part of which is a condition
@@ -97,7 +97,7 @@ class Evaluation:
     def __post_init__(self) -> None:
         """Require that every condition has a name of its own."""
         names = [*self.conditions, *(name for name, _ in _split_levels(self.one_by_one))]
-        for name, count in Counter([IN_DISTRIBUTION, *names, *self.of_agents]).items():
+        for name, count in Counter([IN_DISTRIBUTION, *names, *self.agent_conditions]).items():
             if count > 1:
                 raise UserError(f"evaluate has {count} conditions with the name {name}: rename one")
 
@@ -112,7 +112,7 @@ class Evaluation:
         return conditions(self.conditions, self.one_by_one)
 
     @property
-    def of_agents(self) -> list[str]:
+    def agent_conditions(self) -> list[str]:
         """The conditions that change the agent rather than the task."""
         return [*(f"without_{name}" for name in self.without), *self.networks, *([NEAREST] if self.nearest else [])]
 
@@ -152,8 +152,8 @@ class ReportedRuns:
 class Power:
     """Success rates that `job=plan` is to tell apart, and with which probability."""
 
-    rates: tuple[Between, Between]
-    power: Between  # the probability
+    rates: tuple[OpenShare, OpenShare]
+    power: OpenShare  # the probability
     discordant: Share | None  # share of episodes in which only one of two policies succeeds
     runs: tuple[Text, Text] | None  # from which to take that share
 

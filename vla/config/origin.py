@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 
-from vla.config.packages import config_folders, option_folders, trusted
+from vla.config.packages import config_folders, option_folders, trusted_names
 from vla.io.documents import STRICT
 from vla.io.errors import counted
 from vla.parallel.limits import cores, processor
@@ -49,7 +49,7 @@ def _without_secret(override: str) -> str:
 
 def _commits() -> dict[str, str]:
     """Return the commits of this package, of its options, and of the packages that add parts."""
-    packages = {"vla", *dict(option_folders()), *(name.partition(".")[0] for name in trusted())}
+    packages = {"vla", *dict(option_folders()), *(name.partition(".")[0] for name in trusted_names())}
     specs = [find_spec(package) for package in sorted(packages)]
     places = [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
     trees = dict[str, str]()

@@ -69,23 +69,23 @@ def option_folders() -> tuple[tuple[str, Path], ...]:
     return tuple(folders)
 
 
-def trust(packages: Any, chosen: Iterable[Any], used: Iterable[Any] = ()) -> None:
+def trust(packages: Any, targets: Iterable[Any], node_packages: Iterable[Any] = ()) -> None:
     """Set the third-party classes that this process and its children may build; raise a UserError for unsuitable ones.
 
     Args:
         packages: list of names, in addition to those in the environment variable `VLA_TRUST`.
-        chosen: every `_target_` in the config composed from the command line, before any file is read. Of packages that
-            add options, exactly these classes are trusted.
-        used: every `package` argument in that config; these packages are trusted, too.
+        targets: every `_target_` in the config composed from the command line, before any file is read. Of packages
+            that add options, exactly these classes are trusted.
+        node_packages: every `package` argument in that config; these packages are trusted, too.
     """
     if not isinstance(packages, list):
         raise UserError(f"trust must be a list of packages, as in trust=[mypackage], got {packages!r}")
-    used = [name for name in used if name != MISSING]
-    names = [*packages, *_names(TRUST), *used]
+    node_packages = [name for name in node_packages if name != MISSING]
+    names = [*packages, *_names(TRUST), *node_packages]
     for name in names:
-        _require_trustworthy("package" if name in used else "trust", name)
+        _require_trustworthy("package" if name in node_packages else "trust", name)
     providers = {package for package, _ in option_folders()}
-    classes = {target for target in chosen if isinstance(target, str) and target.partition(".")[0] in providers}
+    classes = {target for target in targets if isinstance(target, str) and target.partition(".")[0] in providers}
     os.environ[TRUSTED] = ",".join(sorted({*names, *classes}))
 
 
@@ -97,7 +97,7 @@ def trusting(packages: Sequence[str]) -> Iterator[None]:
     for name in packages:
         _require_trustworthy("trust", name)
     old_value = os.environ.get(TRUSTED)
-    os.environ[TRUSTED] = ",".join(sorted({*trusted(), *packages}))
+    os.environ[TRUSTED] = ",".join(sorted({*trusted_names(), *packages}))
     try:
         yield
     finally:
@@ -106,14 +106,14 @@ def trusting(packages: Sequence[str]) -> Iterator[None]:
             os.environ[TRUSTED] = old_value
 
 
-def trusted() -> list[str]:
+def trusted_names() -> list[str]:
     """Return the trusted packages and classes; outside a run, those in the environment variable `VLA_TRUST`."""
     return _names(TRUSTED if TRUSTED in os.environ else TRUST)
 
 
 def is_trusted(target: Any) -> bool:
     """Return whether the third-party class or package `target` may be used."""
-    matches = isinstance(target, str) and any(f"{target}.".startswith(f"{name}.") for name in trusted())
+    matches = isinstance(target, str) and any(f"{target}.".startswith(f"{name}.") for name in trusted_names())
     return matches and can_be_trusted(target.partition(".")[0])
 
 

@@ -12,9 +12,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from vla.config.annotations import locate
-from vla.config.build import GROUPS, check_node, makes
+from vla.config.build import GROUPS, check_node, product_type
 from vla.config.packages import config_folders
-from vla.io.documents import canonical, resolved
+from vla.io.documents import canonicalize, resolve_config
 from vla.io.errors import UserError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def digest(*keys: str, _root_: DictConfig) -> str:
     """
     values = [OmegaConf.select(_root_, key, throw_on_missing=True) for key in keys]
     plain = [OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value for value in values]
-    return hashlib.sha256(json.dumps(canonical(plain)).encode()).hexdigest()[:12]
+    return hashlib.sha256(json.dumps(canonicalize(plain)).encode()).hexdigest()[:12]
 
 
 def chosen(group: str, *, _root_: DictConfig) -> str | None:
@@ -45,7 +45,7 @@ def recorded(name: str, *, _root_: DictConfig) -> Any:
     """
     recording = _recording(json.dumps(OmegaConf.to_container(_root_.expert, resolve=True)))
     if name not in ("low", "high"):
-        value = resolved(getattr(recording, name), "the recording")
+        value = resolve_config(getattr(recording, name), "the recording")
         return ListConfig(value) if isinstance(value, list) else value
     action = list(_root_.task.action)
     if unknown := [component for component in action if component not in recording.bounds]:
@@ -59,7 +59,7 @@ def _recording(expert: str) -> Recording:
     from vla.data.formats.imported_demonstrations import ImportedDemonstrations
 
     options, group = json.loads(expert), GROUPS["expert"]
-    check_node("expert", options, makes(group), group.runtime)
+    check_node("expert", options, product_type(group), group.runtime)
     target = locate("expert._target_", options.pop("_target_"))
     if not issubclass(target, ImportedDemonstrations):
         raise UserError(

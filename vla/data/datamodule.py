@@ -24,7 +24,7 @@ from torch import Tensor
 
 from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry, recording_of
-from vla.data.window_batches import Batch, WindowBatcher, joined
+from vla.data.window_batches import Batch, WindowBatcher, concatenate_batches
 from vla.io.errors import UserError, counted
 from vla.io.types import Count, Natural, Rate, Seed
 from vla.spec import Array, Spec
@@ -34,7 +34,7 @@ from vla.spec import Array, Spec
 GOLDEN_RATIO = 2654435769
 
 
-def held_out(recording: int, fraction: float) -> bool:
+def is_held_out(recording: int, fraction: float) -> bool:
     """Return whether an episode is held out for validation, independently of others, by its `recording_of`."""
     return recording * GOLDEN_RATIO % 2**32 < fraction * 2**32
 
@@ -148,7 +148,7 @@ class WindowDataModule(LightningDataModule):
             if store.spec.truth:  # a further store may lack it, which becomes NaN
                 replace(store.spec, truth=self._spec.truth).require(store.spec, "the model", name)
             for entry in store.episodes:
-                windows = holdout if held_out(recording_of(entry), self._fraction) else training
+                windows = holdout if is_held_out(recording_of(entry), self._fraction) else training
                 windows.append(offset + np.arange(entry.start, entry.end))
         episodes = [entry for store in stores for entry in store.episodes]
         if not training or (self._fraction > 0 and not holdout):
@@ -170,7 +170,7 @@ class WindowDataModule(LightningDataModule):
         store = self._starts.searchsorted(windows, side="right") - 1
         numbers = np.unique(store).tolist()
         parts = [self._batchers[number](windows[store == number] - self._starts[number]) for number in numbers]
-        batch = parts[0] if len(parts) == 1 else joined(parts)
+        batch = parts[0] if len(parts) == 1 else concatenate_batches(parts)
         if self._tokenize is not None:
             text = self._tokenize(batch["instruction"])
             batch["text"] = text.pin_memory() if self._on_gpu() else text

@@ -17,11 +17,11 @@ from vla.data.header import Codec
 from vla.data.index import DAMAGED, LOST, Entry
 from vla.data.verification import entries_by_config, episode_of, without_rows
 from vla.io.errors import UserError
-from vla.io.files import atomic_path, locked, remove_drafts
+from vla.io.files import atomic_path, remove_drafts, try_lock
 from vla.io.printable import track
 
 Copies = Sequence[tuple[EpisodeStore, Entry]]  # of one seed and config
-Chosen = dict[str, dict[int, list[tuple[EpisodeStore, Entry]]]]  # config as JSON → seed → its copies
+EpisodeSelection = dict[str, dict[int, list[tuple[EpisodeStore, Entry]]]]  # config as JSON → seed → its copies
 
 
 def derive_store(
@@ -37,12 +37,12 @@ def derive_store(
     for store in stores[1:]:
         store.spec.require(stores[0].spec, f"the episode store {store.folder}", f"{stores[0].folder}")
     selection = _choose(stores, where or {})
-    if not any(entry.stored for seeds in selection.values() for copies in seeds.values() for _, entry in copies):
+    if not any(entry.is_stored for seeds in selection.values() for copies in seeds.values() for _, entry in copies):
         condition = f" that fit inspect.where={dict(where)}" if where else ""
         raise UserError(f"{', '.join(str(store.folder) for store in stores)}: there are no episodes{condition}")
     folder.parent.mkdir(parents=True, exist_ok=True)
     message = f"another process writes {folder}: wait for it, or choose another inspect.into"
-    lock = locked(folder.with_name(f".{folder.name}.lock"), message)
+    lock = try_lock(folder.with_name(f".{folder.name}.lock"), message)
     try:
         if folder.exists():
             raise UserError(f"{folder} exists already and is left alone: choose another inspect.into")
@@ -65,9 +65,9 @@ def derive_store(
     return damaged_seeds
 
 
-def _choose(stores: Sequence[EpisodeStore], where: Mapping[str, Any]) -> Chosen:
-    matches = episode_filter(where, [entry for store in stores for entry in store.tried])
-    selection: Chosen = {}
+def _choose(stores: Sequence[EpisodeStore], where: Mapping[str, Any]) -> EpisodeSelection:
+    matches = episode_filter(where, [entry for store in stores for entry in store.attempts])
+    selection: EpisodeSelection = {}
     for store in stores:
         for config, entries in entries_by_config(store):
             key = json.dumps(config)
@@ -76,9 +76,11 @@ def _choose(stores: Sequence[EpisodeStore], where: Mapping[str, Any]) -> Chosen:
     return selection
 
 
-def _config(selection: Chosen, stores: Sequence[EpisodeStore], where: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the config of the episodes if one collection could have produced them all, else that of `Derived`."""
-    conditions = [condition for store in stores if store.derived for condition in store.config["where"]]
+def _config(
+    selection: EpisodeSelection, stores: Sequence[EpisodeStore], where: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Return the config of the episodes if one collection could have produced them all, else a `DerivedConfig`."""
+    conditions = [condition for store in stores if store.is_derived for condition in store.config["where"]]
     conditions += [dict(where)] if where else []
     (config, seeds), *other_configs = selection.items()
     same_loss = len({store.codec.loss for store in stores}) == 1
@@ -90,12 +92,14 @@ def _config(selection: Chosen, stores: Sequence[EpisodeStore], where: Mapping[st
 def _write(target: EpisodeStore, copies: Copies, repair: bool) -> bool:
     """Add a seed to a store from its first undamaged copy; returns whether there was one."""
     candidates = [(source, entry) for source, entry in copies if entry.outcome != LOST]
-    for source, entry in sorted(candidates, key=lambda copy: not copy[1].stored):  # an episode rather than a failure
-        if not entry.stored:
+    for source, entry in sorted(candidates, key=lambda copy: not copy[1].is_stored):  # an episode rather than a failure
+        if not entry.is_stored:
             target.fail(without_rows(entry))
             return True
         try:
-            target.append(episode_of(source, entry), source.packed(entry) if source.codec == target.codec else None)
+            target.append(
+                episode_of(source, entry), source.packed_images(entry) if source.codec == target.codec else None
+            )
             return True
         except DamageError:
             if not repair:

@@ -18,12 +18,12 @@ from vla.io.errors import UserError, suggestion
 FACTS = ("seed", "task", "instruction", "outcome", "steps")
 
 
-def flat(draws: Mapping[str, Any]) -> dict[str, Any]:
+def flatten(draws: Mapping[str, Any]) -> dict[str, Any]:
     """Return dotted name → value of all draws of an episode."""
     values: dict[str, Any] = {}
     for name, draw in draws.items():
         if isinstance(draw, Mapping):
-            values |= {f"{name}.{key}": value for key, value in flat(draw).items()}
+            values |= {f"{name}.{key}": value for key, value in flatten(draw).items()}
         else:
             values[str(name)] = draw
     return values
@@ -61,7 +61,7 @@ def episode_filter(where: Mapping[str, Any], entries: Iterable[Entry]) -> Callab
 
 
 def _facts(entry: Entry) -> dict[str, Any]:
-    return {**{name: getattr(entry, name) for name in FACTS}, **flat(entry.draws)}
+    return {**{name: getattr(entry, name) for name in FACTS}, **flatten(entry.draws)}
 
 
 def _condition(name: str, criterion: Any) -> Callable[[Any], bool]:

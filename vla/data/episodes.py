@@ -28,8 +28,8 @@ from filelock import FileLock, Timeout
 
 from vla.data.fields import Field, Rows, ScatteredRows
 from vla.data.header import RAW, Codec, fields_of, is_store, read_header, write_header
-from vla.data.index import INDEX, REMEDY, SALVAGE, Entry, dumps, index_line, listed, parse_line, read_index
-from vla.io.documents import canonical
+from vla.data.index import INDEX, REMEDY, SALVAGE, Entry, dumps, format_numbers, index_line, parse_line, read_index
+from vla.io.documents import canonicalize
 from vla.io.errors import UserError, counted
 from vla.parallel.limits import memory
 from vla.spec import FIRST_SEED, ActionStatistics, Array, Episode, Observation, Spec
@@ -40,11 +40,11 @@ log = logging.getLogger(__name__)
 
 
 class DamageError(UserError):
-    """Rows of a store are damaged; `what` is the kind of damage."""
+    """Rows of a store are damaged; `damage` is the kind of damage."""
 
-    def __init__(self, message: str, what: str = "rows changed or lost") -> None:
+    def __init__(self, message: str, damage: str = "rows changed or lost") -> None:
         super().__init__(f"{message}: {SALVAGE}")
-        self.what = what
+        self.damage = damage
 
 
 class EpisodeStore:
@@ -63,17 +63,18 @@ class EpisodeStore:
     Args:
         folder: of the store.
         episodes: number of episodes to use, the first ones; None: all.
-        damaged: also open a store with truncated files or unreadable index lines; the seeds of the latter are `LOST`.
+        allow_damage: also open a store with truncated files or unreadable index lines; the seeds of the latter
+            are `LOST`.
     """
 
-    def __init__(self, folder: str | Path, episodes: int | None = None, damaged: bool = False) -> None:
+    def __init__(self, folder: str | Path, episodes: int | None = None, allow_damage: bool = False) -> None:
         self.folder = Path(folder)
         header, self.spec = read_header(self.folder)
         self.config: dict[str, Any] = header.config
         self.codec: Codec = header.codec
         self.fields = {name: Field(self.folder, name, *row, self.codec) for name, row in fields_of(self.spec).items()}
         self.row_size = sum(column.size for column in self.fields.values())
-        self._limit, self._damaged = episodes, damaged
+        self._limit, self._damaged = episodes, allow_damage
         self._index, self._files = self.folder / INDEX, dict[Path, BinaryIO]()
         self._refresh()
         if episodes is not None and len(self.episodes) < episodes:
@@ -89,7 +90,7 @@ class EpisodeStore:
         if not is_store(folder):
             folder.mkdir(parents=True, exist_ok=True)
             with FileLock(folder / "lock"):
-                write_header(folder, spec, plain_config, codec or Codec.suited(spec))
+                write_header(folder, spec, plain_config, codec or Codec.for_spec(spec))
         store = cls(folder)
         spec.require(store.spec, "this task", f"the episode store {folder}")
         store.require(plain_config)
@@ -98,17 +99,19 @@ class EpisodeStore:
 
     def require(self, config: Mapping[str, Any]) -> None:
         """Raise a UserError if the episodes have another config; a derived store, chosen explicitly, may have any."""
-        if self.derived:
+        if self.is_derived:
             return
-        new_config, stored_config = canonical(json.loads(dumps(config))), canonical(self.config)
+        new_config, stored_config = canonicalize(json.loads(dumps(config))), canonicalize(self.config)
         keys = sorted(key for key in {*new_config, *stored_config} if new_config.get(key) != stored_config.get(key))
         if keys:
             raise UserError(f"{self.folder} has episodes of another {', '.join(keys)}: set another collect.folder")
 
     def lacks(self, key: str, node: Any) -> bool:
         """Return whether the store is derived, and no part of it has `node` under `key` in its config."""
-        plain_node = canonical(json.loads(dumps(node)))
-        return self.derived and all(canonical(config.get(key)) != plain_node for config, _ in self.config["parts"])
+        plain_node = canonicalize(json.loads(dumps(node)))
+        return self.is_derived and all(
+            canonicalize(config.get(key)) != plain_node for config, _ in self.config["parts"]
+        )
 
     def require_codec(self, codec: Codec | None) -> None:
         """Raise a UserError if the images have other losses than those of `codec`; None accepts any."""
@@ -119,13 +122,13 @@ class EpisodeStore:
 
     def require_first_seed(self, seed: int) -> None:
         """Raise a UserError if the first episode has another seed; a derived store may begin anywhere."""
-        if self.tried and not self.derived and self.tried[0].seed != seed:
-            first_seed = self.tried[0].seed
+        if self.attempts and not self.is_derived and self.attempts[0].seed != seed:
+            first_seed = self.attempts[0].seed
             raise UserError(f"{self.folder} starts at seed {first_seed}, not {seed}: set collect.seed={first_seed}")
 
     def require_growable(self) -> None:
         """Raise a UserError if no episodes may be added, because the present ones were copied from other stores."""
-        if self.derived:
+        if self.is_derived:
             size = len(self.episodes)
             raise UserError(f"{self.folder} was derived from other stores and cannot grow: set collect.episodes={size}")
 
@@ -135,14 +138,14 @@ class EpisodeStore:
             raise UserError(f"{self.folder} holds no episodes yet: collect some first")
 
     @property
-    def derived(self) -> bool:
+    def is_derived(self) -> bool:
         """True if the episodes were copied from other stores rather than collected."""
         return "parts" in self.config
 
     @property
     def next_seed(self) -> int | None:
         """Next seed to try; None if none has been tried yet, or if any may follow."""
-        return self.tried[-1].seed + 1 if self.tried and not self.derived else None
+        return self.attempts[-1].seed + 1 if self.attempts and not self.is_derived else None
 
     @property
     def statistics(self) -> ActionStatistics:
@@ -154,22 +157,24 @@ class EpisodeStore:
         """Return the rows of a numeric field in `episodes`, (N, …), without those of further episodes in the store."""
         return np.asarray(self.rows(field))[: self.episodes[-1].end]
 
-    def rows(self, field: str, scattered: bool = False) -> Rows:
+    def rows(self, field: str, in_random_order: bool = False) -> Rows:
         """Return all committed rows of `field`, (N, …), which are read when they are indexed.
 
-        Compressed images, and rows of a large store that will be read in random order (`scattered`), are
+        Compressed images, and rows of a large store that will be read `in_random_order`, are
         `ScatteredRows`, which raise a DamageError for a damaged image. All other rows are a memory-mapped array.
         """
         column = self.fields[field]
         if self._rows == 0:  # an empty file cannot be mapped
             return np.empty((0, *column.shape), column.dtype)
         large = self._rows * self.row_size > IN_MEMORY * memory()
-        return column.rows(self._rows, partial(self._image_error, field), scattered and large)
+        return column.rows(self._rows, partial(self._image_error, field), in_random_order and large)
 
-    def packed(self, entry: Entry) -> dict[str, list[bytes]]:
+    def packed_images(self, entry: Entry) -> dict[str, list[bytes]]:
         """Return the compressed images of an episode, by field; a DamageError if one is damaged."""
         sources = {field: self.rows(field) for field in self.fields}
-        return {field: rows.packed(entry.span) for field, rows in sources.items() if isinstance(rows, ScatteredRows)}
+        return {
+            field: rows.packed_rows(entry.span) for field, rows in sources.items() if isinstance(rows, ScatteredRows)
+        }
 
     def size(self, field: str, entry: Entry) -> int:
         """Return the size of a field of an episode on disk [bytes]."""
@@ -207,11 +212,11 @@ class EpisodeStore:
             raise self._rows_error(*damages) if len(damages) > 1 else damages.popitem()[1]
 
     def _rows_error(self, *seeds: int) -> DamageError:
-        seeds_text = f"seed {seeds[0]}" if len(seeds) == 1 else f"the seeds {listed(seeds)}"
+        seeds_text = f"seed {seeds[0]}" if len(seeds) == 1 else f"the seeds {format_numbers(seeds)}"
         return DamageError(f"the rows of {seeds_text} in {self.folder} were changed on disk")
 
     def _image_error(self, field: str, row: int) -> DamageError:
-        entry = next(entry for entry in self.tried if entry.start <= row < entry.end)
+        entry = next(entry for entry in self.attempts if entry.start <= row < entry.end)
         image = f"{field} of step {row - entry.start}"
         message = f"{image} of seed {entry.seed} in {self.folder} was changed on disk"
         return DamageError(message, f"{image} changed or lost")
@@ -242,11 +247,11 @@ class EpisodeStore:
             for file in self._files.values():
                 os.fsync(file.fileno())
 
-    def append(self, episode: Episode, packed: Mapping[str, Sequence[bytes]] | None = None) -> None:
+    def append(self, episode: Episode, packed_images: Mapping[str, Sequence[bytes]] | None = None) -> None:
         """Store an episode atomically: a success, or a failure whose labels are to be kept (UserError: it does not
         match the spec, has several instructions or another seed than the next, or cannot be written).
 
-        `packed` are its compressed images from another store with the same codec, so that JPEG loses nothing more.
+        `packed_images` are its compressed images from another store with the same codec, so that JPEG loses no more.
         """
         if len({observation.instruction for observation in episode.observations}) > 1:
             raise UserError(
@@ -254,9 +259,11 @@ class EpisodeStore:
                 f"seed {FIRST_SEED} one each"
             )
         rows = rows_of(self.spec, episode)
-        pieces = {name: self.fields[name].pieces(self._rows, rows[name], (packed or {}).get(name)) for name in rows}
+        pieces = {
+            name: self.fields[name].pieces(self._rows, rows[name], (packed_images or {}).get(name)) for name in rows
+        }
         # Checksums of JPEG are of the compressed bytes, because decoders differ in rounding.
-        jpeg = [name for name in rows if self.codec.of(name) == "jpeg"]
+        jpeg = [name for name in rows if self.codec.of_field(name) == "jpeg"]
         crc = {name: zlib.crc32(pieces[name][0] if name in jpeg else rows[name].data) for name in rows}
         self._commit(self._entry(episode, crc), pieces)
 
@@ -291,8 +298,8 @@ class EpisodeStore:
                 for path, content in zip(self.fields[name].files, contents, strict=True):
                     _write(self._files[path], memoryview(content))
             _write(self._files[self._index], memoryview(line))
-            self.tried.append(entry)
-            if entry.stored and (self._limit is None or len(self.episodes) < self._limit):
+            self.attempts.append(entry)
+            if entry.is_stored and (self._limit is None or len(self.episodes) < self._limit):
                 self.episodes.append(entry)
             self._rows += entry.steps
             self._index_size += len(line)
@@ -315,11 +322,11 @@ class EpisodeStore:
         files = [column.files[0] for column in self.fields.values()]
         if not self._index.exists() and (orphans := [path for path in files if path.exists()]):
             raise UserError(f"{self._index} is missing, which {orphans[0].name} beside it needs: {REMEDY}")
-        self.tried, self._index_size = read_index(self._index, self.derived, self._damaged)
-        self.episodes = [entry for entry in self.tried if entry.stored][: self._limit]
-        self._rows = max((entry.end for entry in self.tried), default=0)
+        self.attempts, self._index_size = read_index(self._index, self.is_derived, self._damaged)
+        self.episodes = [entry for entry in self.attempts if entry.is_stored][: self._limit]
+        self._rows = max((entry.end for entry in self.attempts), default=0)
         for column in self.fields.values():
-            complete_rows = column.whole(self._rows)
+            complete_rows = column.count_complete_rows(self._rows)
             if complete_rows < self._rows and not self._damaged:
                 raise UserError(f"{column.files[0]} is shorter than its index says: {SALVAGE}")
             self._rows = complete_rows
@@ -364,7 +371,7 @@ def observations_of(spec: Spec, rows: Mapping[str, Array], instruction: str) -> 
 def _checksum(rows: Rows, span: slice, values: Array | None = None) -> int:
     """Return the CRC-32 of the rows in `span`, `values` if they were read already; for JPEG of the compressed bytes."""
     if isinstance(rows, ScatteredRows) and rows.codec == "jpeg":
-        return zlib.crc32(b"".join(rows.packed(span)))
+        return zlib.crc32(b"".join(rows.packed_rows(span)))
     return zlib.crc32((rows[span] if values is None else values).data)
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from vla.data.header import Codec
-from vla.data.image_codec import decode, encode, in_threads
+from vla.data.image_codec import decode, encode, run_in_threads
 from vla.io.errors import UserError
 from vla.io.files import require_file
 from vla.spec import Array
@@ -22,7 +22,7 @@ from vla.spec import Array
 END = np.dtype([("end", "<u8"), ("crc", "<u4")])
 MAX_OVERHEAD = 4096  # largest number of bytes by which compression may enlarge an image
 
-Damaged = Callable[[int], UserError]  # row → the error to raise
+DamageErrorFactory = Callable[[int], UserError]  # row → the error to raise
 
 
 class ScatteredRows:
@@ -34,12 +34,12 @@ class ScatteredRows:
     Args:
         field: the field of the rows.
         count: number of rows N.
-        damaged: makes the error for a row that cannot be read.
+        damage_error: makes the error for a row that cannot be read.
     """
 
-    def __init__(self, field: Field, count: int, damaged: Damaged) -> None:
+    def __init__(self, field: Field, count: int, damage_error: DamageErrorFactory) -> None:
         self.shape, self.dtype, self.codec = (count, *field.shape), field.dtype, field.codec
-        self._size, self._damage_error = field.size, damaged
+        self._size, self._damage_error = field.size, damage_error
         self._file = field.files[0].open("rb", buffering=0)
         self._descriptor = self._file.fileno()
         os.posix_fadvise(self._descriptor, 0, 0, os.POSIX_FADV_RANDOM)
@@ -67,14 +67,14 @@ class ScatteredRows:
                 raise self._damage_error(int(rows[number])) from error
 
         if self._ends is not None:
-            in_threads(unpack, len(rows))
+            run_in_threads(unpack, len(rows))
             return out
         for row, image, (start, size) in zip(rows, images, places, strict=True):
             if os.preadv(self._descriptor, [image], start) < size:
                 raise self._damage_error(int(row))
         return out
 
-    def packed(self, rows: slice) -> list[bytes]:
+    def packed_rows(self, rows: slice) -> list[bytes]:
         """Return consecutive rows in compressed form."""
         index = np.arange(*rows.indices(len(self)))
         return [self._read_packed(row, *place) for row, place in zip(index.tolist(), self._places(index), strict=True)]
@@ -110,7 +110,7 @@ class Field:
 
     def __init__(self, folder: Path, name: str, shape: tuple[int, ...], dtype: np.dtype, codec: Codec) -> None:
         self.shape, self.dtype = shape, dtype
-        self.codec, self._quality = codec.of(name), codec.quality
+        self.codec, self._quality = codec.of_field(name), codec.quality
         self.size = int(np.prod(shape)) * dtype.itemsize  # of a decoded row [bytes]
         suffixes = ("bin",) if self.codec == "raw" else ("pack", "ends")
         self.files = [folder / f"{name}.{suffix}" for suffix in suffixes]
@@ -123,7 +123,7 @@ class Field:
         end = int(np.fromfile(self.files[1], END, 1, offset=offset)["end"][0]) if rows else 0
         return [end, rows * END.itemsize]
 
-    def whole(self, rows: int) -> int:
+    def count_complete_rows(self, rows: int) -> int:
         """Return how many of the first `rows` rows are complete: fewer if a file was truncated (UserError: one is no
         file)."""
         for path in self.files:
@@ -135,23 +135,23 @@ class Field:
         indices = np.flatnonzero(np.fromfile(self.files[1], END, rows)["end"] <= sizes[0])
         return int(indices[-1]) + 1 if len(indices) else 0  # a changed end is detected when the image is read
 
-    def rows(self, count: int, damaged: Damaged, scattered: bool = False) -> Rows:
-        """Return the first `count` > 0 rows, which are read when they are indexed; `scattered`: for random order."""
-        if scattered or self.codec != "raw":
-            return ScatteredRows(self, count, damaged)
+    def rows(self, count: int, damage_error: DamageErrorFactory, in_random_order: bool = False) -> Rows:
+        """Return the first `count` > 0 rows, which are read when they are indexed, perhaps `in_random_order`."""
+        if in_random_order or self.codec != "raw":
+            return ScatteredRows(self, count, damage_error)
         return np.asarray(np.memmap(self.files[0], self.dtype, mode="r", shape=(count, *self.shape)))
 
-    def pieces(self, rows: int, values: Array, packed: Sequence[bytes] | None) -> list[bytes | memoryview]:
-        """Return the bytes to append to every file for `values` (N, …) after `rows` rows; `packed`: compressed ones."""
+    def pieces(self, rows: int, values: Array, packed_rows: Sequence[bytes] | None) -> list[bytes | memoryview]:
+        """Return the bytes to append to every file for `values` (N, …) after `rows` rows; `packed_rows`: compressed."""
         if self.codec == "raw":
             return [values.data.cast("B")]
-        images = list(packed) if packed is not None else [b""] * len(values)
+        images = list(packed_rows) if packed_rows is not None else [b""] * len(values)
 
         def compress(number: int) -> None:
             images[number] = encode(values[number], self.codec, self._quality)
 
-        if packed is None:
-            in_threads(compress, len(values))
+        if packed_rows is None:
+            run_in_threads(compress, len(values))
         ends = np.empty(len(images), END)
         ends["end"] = self.sizes(rows)[0] + np.cumsum([len(image) for image in images])
         ends["crc"] = [zlib.crc32(image) for image in images]

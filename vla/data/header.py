@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Ge, Le
 
-from vla.data.index import REMEDY, Plain, dumps
-from vla.io.documents import STRICT, parse_json, parse_plain, read_bounded, resolved
+from vla.data.index import REMEDY, JsonObject, dumps
+from vla.io.documents import STRICT, parse_json, parse_plain, read_bounded, resolve_config
 from vla.io.errors import UserError
 from vla.io.files import write_text
 from vla.io.types import Images, Quality
@@ -32,7 +32,7 @@ class Codec:
     quality: Quality | None = None  # of JPEG
 
     @classmethod
-    def suited(cls, spec: Spec) -> Codec:
+    def for_spec(cls, spec: Spec) -> Codec:
         """Return the codec for images of the size in `spec`: raw up to `LARGEST_RAW`, beyond it lossless."""
         return cls("raw" if max(spec.image_size) <= LARGEST_RAW else "lossless")
 
@@ -45,7 +45,7 @@ class Codec:
         """The lossy part of the codec, equal for codecs that decode to the same images."""
         return self if self.images == "jpeg" else RAW
 
-    def of(self, field: str) -> Images:
+    def of_field(self, field: str) -> Images:
         """Return the codec of a field."""
         kind = field.partition("_")[0]
         if kind not in ("rgb", "depth"):
@@ -57,13 +57,13 @@ RAW = Codec()
 
 
 @dataclass(frozen=True)
-class Derived:
+class DerivedConfig:
     """Config of a store that was derived from others."""
 
     __pydantic_config__ = STRICT
 
-    parts: list[tuple[Plain, Annotated[int, Ge(1), Le(2**53)]]]  # a config, and how many entries in a row have it
-    where: list[Plain]  # the filters that were applied, in order
+    parts: list[tuple[JsonObject, Annotated[int, Ge(1), Le(2**53)]]]  # a config, and how many entries in a row have it
+    where: list[JsonObject]  # the filters that were applied, in order
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Header:
 
     format: int
     spec: Any
-    config: Plain  # of task and expert, or `Derived`
+    config: JsonObject  # of task and expert, or `DerivedConfig`
     fields: Any  # field → shape and dtype of a row
     codec: Codec = RAW  # of the images; not written if they are raw
 
@@ -115,8 +115,8 @@ def _parse(content: bytes, path: Path) -> tuple[Header, Spec]:
     header = parse_json(content, Header, str(path))
     spec = Spec.from_dict(header.spec, f"{path}: spec")
     if "parts" in header.config:
-        parse_plain(header.config, Derived, f"{path}: config")
-    resolved(header.config, str(path))
+        parse_plain(header.config, DerivedConfig, f"{path}: config")
+    resolve_config(header.config, str(path))
     has_quality = header.codec.quality is not None
     if header.fields != _layouts(spec) or has_quality != (header.codec.images == "jpeg"):
         raise UserError(f"{path} is damaged or of another kind: its fields are not those of its spec and codec")

@@ -32,13 +32,13 @@ def encode(image: Array, codec: Images, quality: int | None) -> bytes:
     return buffer.getvalue()
 
 
-def decode(packed: bytes, codec: Images, shape: tuple[int, ...], dtype: np.dtype) -> Array:
+def decode(content: bytes, codec: Images, shape: tuple[int, ...], dtype: np.dtype) -> Array:
     """Invert `encode`; a UserError for damaged images and those of another shape."""
     try:
         if codec == "lossless":
-            rows = _zstandard().decompress(packed, int(np.prod(shape)) * dtype.itemsize)
+            rows = _zstandard().decompress(content, int(np.prod(shape)) * dtype.itemsize)
             return np.frombuffer(rows, dtype).reshape(shape)
-        image = _unpack_jpeg(packed)
+        image = _unpack_jpeg(content)
     except (OSError, RuntimeError, ValueError) as error:
         raise UserError(f"the image cannot be decoded ({str(error)[:200]})") from error
     if image.shape != shape:
@@ -60,7 +60,7 @@ def _unpack_jpeg(packed: bytes) -> Array:
     return image.permute(1, 2, 0).numpy()
 
 
-def in_threads(work: Callable[[int], None], count: int) -> None:
+def run_in_threads(work: Callable[[int], None], count: int) -> None:
     """Call `work` with 0 … `count` - 1, on one thread per core; an error is raised once all threads have ended."""
     threads, pool = _threads()
 

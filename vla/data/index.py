@@ -35,7 +35,7 @@ def moderate(value: Any) -> bool:
     return not isinstance(value, (int, float)) or abs(value) <= 2**63
 
 
-Plain = Annotated[dict[str, Any], Predicate(moderate)]  # from JSON
+JsonObject = Annotated[dict[str, Any], Predicate(moderate)]  # from JSON
 Offset = Annotated[int, Ge(0), Le(2**53)]
 Crc = Annotated[int, Ge(0), Le(2**32 - 1)]
 
@@ -53,7 +53,7 @@ class Entry:
     instruction: Annotated[str, MaxLen(LONGEST_INSTRUCTION)]
     start: Offset  # first row of the episode in every field file
     steps: Offset
-    draws: Plain  # randomisation axis → drawn values
+    draws: JsonObject  # randomisation axis → drawn values
     crc: dict[str, Crc]  # field → CRC-32 of its rows, or of the files if they are JPEG; empty for failures
 
     @property
@@ -62,7 +62,7 @@ class Entry:
         return self.outcome == "success"
 
     @property
-    def stored(self) -> bool:
+    def is_stored(self) -> bool:
         """True if the episode is stored: every success, and the failures of a policy that an expert labels."""
         return self.steps > 0
 
@@ -98,7 +98,7 @@ def parse_line(line: bytes, name: str) -> Entry:
     if _seal(body) != line:
         raise UserError(f"{name} is damaged: it does not fit its checksum")
     entry = parse_json(body, Entry, name)
-    if entry.success and not entry.stored:
+    if entry.success and not entry.is_stored:
         raise UserError(f"{name} is damaged: it is a success without steps")
     return entry
 
@@ -118,7 +118,7 @@ def _to_plain(value: Any) -> Any:
     raise UserError(f"an episode store keeps numbers, strings, lists and dicts, not {value!r}")
 
 
-def listed(numbers: Sequence[int]) -> str:
+def format_numbers(numbers: Sequence[int]) -> str:
     """Format seeds or line numbers for a message, abbreviated if they are many."""
     ordered = sorted(set(numbers))
     if len(ordered) > 2 and ordered[-1] - ordered[0] == len(ordered) - 1:
@@ -127,11 +127,11 @@ def listed(numbers: Sequence[int]) -> str:
     return ", ".join(map(str, ordered[:MAX_LISTED])) + suffix
 
 
-def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], int]:
+def read_index(path: Path, any_seed: bool, allow_damage: bool) -> tuple[list[Entry], int]:
     """Return the entries and their size in bytes, without an incomplete last line (UserError: lines are damaged, and
     named in the message, or do not follow each other).
 
-    Unless `any_seed`, seeds are consecutive, which identifies the `LOST` ones in a `damaged` index.
+    Unless `any_seed`, seeds are consecutive, which identifies the `LOST` ones if damage is allowed.
     """
     lines = _lines(path)
     entries: dict[int, Entry] = {}  # line number → entry
@@ -142,11 +142,11 @@ def read_index(path: Path, any_seed: bool, damaged: bool) -> tuple[list[Entry], 
         except UserError as error:
             problems[number] = str(error)
     remedy = REMEDY if any_seed or not entries else SALVAGE
-    if damaged and remedy == SALVAGE:
+    if allow_damage and remedy == SALVAGE:
         return _with_lost_entries(path, entries, len(lines)), 0
     if problems:
         first_line, *other_lines = problems
-        suffix = f"; so are the lines {listed(other_lines)}" if other_lines else ""
+        suffix = f"; so are the lines {format_numbers(other_lines)}" if other_lines else ""
         raise UserError(f"{problems[first_line]}{suffix}: {remedy}")
     rows, seed = 0, None
     for number, entry in entries.items():

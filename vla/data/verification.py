@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from vla.data.episodes import DamageError, EpisodeStore, observations_of
-from vla.data.index import DAMAGED, LOST, MAX_LISTED, NOT_NEEDED, Entry, listed
+from vla.data.index import DAMAGED, LOST, MAX_LISTED, NOT_NEEDED, Entry, format_numbers
 from vla.io.errors import UserError, counted
 from vla.io.printable import track
 from vla.spec import Array, Episode
@@ -23,8 +23,8 @@ class StoreReport:
     """Result of the verification of a store."""
 
     store: EpisodeStore
-    whole: list[Entry]  # the undamaged episodes
-    damaged: dict[str, list[int]]  # kind of damage → seeds
+    intact_entries: list[Entry]  # the undamaged episodes
+    damaged_seeds: dict[str, list[int]]  # kind of damage → seeds
     actions: Array  # (N, D) float32, of the undamaged episodes
 
     @property
@@ -35,9 +35,9 @@ class StoreReport:
     @property
     def outcomes(self) -> dict[str, int]:
         """Outcome → number of tried seeds, the most frequent first."""
-        discarded_entries = [entry for entry in self.store.tried if not entry.stored]
-        counts = Counter(entry.outcome for entry in (*self.whole, *discarded_entries))
-        counts[DAMAGED] += sum(map(len, self.damaged.values()))
+        discarded_entries = [entry for entry in self.store.attempts if not entry.is_stored]
+        counts = Counter(entry.outcome for entry in (*self.intact_entries, *discarded_entries))
+        counts[DAMAGED] += sum(map(len, self.damaged_seeds.values()))
         successes = counts.pop("success", 0)
         failures = {cause: count for cause, count in counts.most_common() if count and cause not in (LOST, NOT_NEEDED)}
         return {"success": successes, **failures}
@@ -51,7 +51,7 @@ class StoreReport:
     @property
     def sizes(self) -> dict[str, int]:
         """Field → bytes of the undamaged episodes."""
-        return {name: sum(self.store.size(name, entry) for entry in self.whole) for name in self.store.fields}
+        return {name: sum(self.store.size(name, entry) for entry in self.intact_entries) for name in self.store.fields}
 
 
 def verify_store(store: EpisodeStore) -> StoreReport:
@@ -59,13 +59,13 @@ def verify_store(store: EpisodeStore) -> StoreReport:
     entries_by_config(store)  # raises an error if lines are missing
     seeds_by_damage: dict[str, list[int]] = {}
     whole_episodes, actions = [], []
-    if lost_seeds := [entry.seed for entry in store.tried if entry.outcome == LOST]:
+    if lost_seeds := [entry.seed for entry in store.attempts if entry.outcome == LOST]:
         seeds_by_damage["no readable line in the index"] = lost_seeds
     for entry in track(store.episodes, description="verifying"):
         try:
             rows = _finite_rows(store, entry)
         except DamageError as damage:
-            seeds_by_damage.setdefault(damage.what, []).append(entry.seed)
+            seeds_by_damage.setdefault(damage.damage, []).append(entry.seed)
             continue
         whole_episodes.append(entry)
         actions.append(rows["action"])
@@ -75,9 +75,12 @@ def verify_store(store: EpisodeStore) -> StoreReport:
 
 def require_whole(report: StoreReport) -> None:
     """Raise a UserError if a store has damaged episodes or none."""
-    folder, count = report.store.folder, sum(map(len, report.damaged.values()))
-    if report.damaged:
-        problems = [f"{counted(len(seeds), 'seed')}, {listed(seeds)}: {kind}" for kind, seeds in report.damaged.items()]
+    folder, count = report.store.folder, sum(map(len, report.damaged_seeds.values()))
+    if report.damaged_seeds:
+        problems = [
+            f"{counted(len(seeds), 'seed')}, {format_numbers(seeds)}: {kind}"
+            for kind, seeds in report.damaged_seeds.items()
+        ]
         rest = [f"and {counted(len(problems) - MAX_LISTED, 'other')}"] if len(problems) > MAX_LISTED else []
         summary = "; ".join([*problems[:MAX_LISTED], *rest])
         raise UserError(
@@ -90,12 +93,12 @@ def find_episode(store: EpisodeStore, seed: int) -> tuple[dict[str, Any], Episod
     """Return the config and the episode of a seed (UserError: the seed was not tried, failed or occurs twice, or its
     episode is damaged)."""
     pairs = [(config, entry) for config, entries in entries_by_config(store) for entry in entries if entry.seed == seed]
-    stored_pairs = [(config, entry) for config, entry in pairs if entry.stored]
+    stored_pairs = [(config, entry) for config, entry in pairs if entry.is_stored]
     if not pairs:
-        seeds = listed([entry.seed for entry in store.tried]) or "none yet"
+        seeds = format_numbers([entry.seed for entry in store.attempts]) or "none yet"
         raise UserError(f"{store.folder} has no seed {seed}: it holds {seeds}")
     if not stored_pairs:
-        seeds, outcome = listed([entry.seed for entry in store.episodes]) or "none", pairs[0][1].outcome
+        seeds, outcome = format_numbers([entry.seed for entry in store.episodes]) or "none", pairs[0][1].outcome
         raise UserError(
             f"seed {seed} in {store.folder} ended as {outcome}, and its steps were not kept; seeds with steps: {seeds}"
         )
@@ -131,8 +134,8 @@ def _finite_rows(store: EpisodeStore, entry: Entry) -> dict[str, Array]:
 
 def entries_by_config(store: EpisodeStore) -> list[tuple[dict[str, Any], list[Entry]]]:
     """Return the entries of a store by their config; a UserError if the index of a derived store lost lines."""
-    parts = store.config["parts"] if store.derived else [(store.config, len(store.tried))]
+    parts = store.config["parts"] if store.is_derived else [(store.config, len(store.attempts))]
     ends = np.cumsum([entries for _, entries in parts]).tolist()
-    if ends[-1:] != [len(store.tried)]:
+    if ends[-1:] != [len(store.attempts)]:
         raise UserError(f"the index of {store.folder} has lost lines: derive it again from its sources")
-    return [(config, store.tried[end - entries : end]) for (config, entries), end in zip(parts, ends, strict=True)]
+    return [(config, store.attempts[end - entries : end]) for (config, entries), end in zip(parts, ends, strict=True)]

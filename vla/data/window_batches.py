@@ -14,7 +14,7 @@ import torch
 
 from vla.data.episodes import EpisodeStore
 from vla.data.fields import Rows
-from vla.io.images import fitted
+from vla.io.images import fit_images
 from vla.spec import Array, Spec
 
 Batch = dict[str, Any]
@@ -23,7 +23,7 @@ Batch = dict[str, Any]
 SHARE_OF_LABEL, SHARE_OF_RANGE = 0.6, 0.05
 
 
-def perturbed(action: Array, executed: Array, spec: Spec) -> Array:
+def is_perturbed(action: Array, executed: Array, spec: Spec) -> Array:
     """Return (N,) bool: the executed action differs from the (N, D) label by more than proportional noise.
 
     Later labels react to a perturbation that a policy cannot predict, so the loss masks them.
@@ -89,7 +89,7 @@ class WindowBatcher:
         self._numbers = np.concatenate([*columns, missing_truth], axis=1)
         label, executed = numbers["action"][:], numbers["executed"][:]
         self._actions, self._action_size = np.concatenate([label, executed], axis=1), label.shape[1]
-        perturbed_rows = perturbed(label, executed, store.spec)
+        perturbed_rows = is_perturbed(label, executed, store.spec)
         self._perturbations = np.append(0, perturbed_rows.cumsum())  # before each row
         self._store, self._entries = store, (entries := store.episodes)
         self._verified = np.zeros(len(entries), bool)  # images only
@@ -119,7 +119,9 @@ class WindowBatcher:
         perturbations = self._perturbations[labels] - self._perturbations[frames][:, :, None]
         absent = None if present.all() else ~present
         images = {name: self._take(rows, frames, absent) for name, rows in self._images.items()}
-        batch: Batch = {"rgb": {name: self._stage(fitted(image, self._size, "crop")) for name, image in images.items()}}
+        batch: Batch = {
+            "rgb": {name: self._stage(fit_images(image, self._size, "crop")) for name, image in images.items()}
+        }
         numbers = self._take(self._numbers, frames, absent)
         state = self._numbers.shape[1] - self._truth_size
         batch["state"] = self._stage(numbers[..., :state])
@@ -161,11 +163,11 @@ class WindowBatcher:
         return tensor.contiguous().pin_memory() if self._pin else tensor
 
 
-def joined(parts: Sequence[Any]) -> Any:
+def concatenate_batches(parts: Sequence[Any]) -> Any:
     """Concatenate batches, that is, mappings of tensors, lists and mappings."""
     sample = parts[0]
     if isinstance(sample, dict):
-        return {name: joined([part[name] for part in parts]) for name in sample}
+        return {name: concatenate_batches([part[name] for part in parts]) for name in sample}
     if isinstance(sample, list):
         return [item for part in parts for item in part]
     tensor = torch.cat(list(parts))

@@ -42,17 +42,17 @@ class GoalSender:
         kind: Any,
         name: str,
         complaint: Callable[[Any, bool], str],
-        ended: Callable[[], None] = lambda: None,
+        on_end: Callable[[], None] = lambda: None,
     ) -> None:
         """Args:
         node: sends the goals, and fails with one sentence when the server refuses, gives up or vanishes.
         kind: class of the action.
         name: of the server.
         complaint: describes what went wrong from a result and whether another goal has replaced its goal; may be empty.
-        ended: called when the newest goal has ended.
+        on_end: called when the newest goal has ended.
         """
         self.name = node.resolve_topic_name(name)
-        self._node, self.kind, self._complaint, self._ended = node, kind, complaint, ended
+        self._node, self.kind, self._complaint, self._ended = node, kind, complaint, on_end
         self._client = ActionClient(node, kind, name)
         node.created.callback(self._client.destroy)
         self._goals: list[_SentGoal] = []  # whose results still matter, the newest last

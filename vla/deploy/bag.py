@@ -33,7 +33,7 @@ def message_types() -> Any:
 
 
 @contextmanager
-def opened(folder: Path) -> Iterator[Any]:
+def open_bag(folder: Path) -> Iterator[Any]:
     """Open a reader of the bag in a folder; raise a UserError if it is none, or damaged."""
     make_reader = rosbags("rosbag2").Reader
     if not (folder / DESCRIPTION).is_file():

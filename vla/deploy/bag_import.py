@@ -18,10 +18,10 @@ import numpy as np
 
 from vla.data.formats import imported_demonstrations as imported
 from vla.deploy import messages
-from vla.deploy.bag import DESCRIPTION, bag_errors, messages_of, opened
-from vla.deploy.control_loop import REPEATED
+from vla.deploy.bag import DESCRIPTION, bag_errors, messages_of, open_bag
+from vla.deploy.control_loop import REPETITION_TIME
 from vla.deploy.joint_limiter import JointLimits
-from vla.deploy.observer import HISTORY, OLDEST, Measured, Observer
+from vla.deploy.observer import HISTORY, MAX_STAMP_AGE, JointMeasurement, Observer
 from vla.deploy.safety import State
 from vla.deploy.settings import Topics
 from vla.io.errors import UserError
@@ -31,17 +31,17 @@ from vla.spec import LONGEST_INSTRUCTION, Array, Episode, Spec
 
 STATUS = "/vla_agent/status"  # end of the name of the topic that tells who moves the arm
 GAP = 0.3  # longest time between two commands of one motion [s]
-MEASURED_WITHIN = 0.2  # largest time between an observation and its joint state [s]
-STILL, STILL_OPENING = 0.01, 0.002  # an arm that has moved less [rad], and its gripper [m], is at rest
+MAX_JOINT_STATE_GAP = 0.2  # largest time between an observation and its joint state [s]
+REST_MOTION, REST_OPENING = 0.01, 0.002  # an arm that has moved less [rad], and its gripper [m], is at rest
 LEAD = 0.1  # time that is kept before a person's motion begins and after it ends [s]
-LATE = 1.5  # longest time between two steps without a warning [control periods]
-SHORTEST = 0.5  # shorter segments are left out [s]
-MOSTLY = 0.5  # largest share of a component's actions beyond its bounds; a larger one means other units
+MAX_STEP_GAP = 1.5  # longest time between two steps without a warning [control periods]
+MIN_SEGMENT = 0.5  # shorter segments are left out [s]
+MAX_OUTSIDE_SHARE = 0.5  # largest share of a component's actions beyond its bounds; a larger one means other units
 
 log = logging.getLogger(__name__)
 
 Track = list[tuple[float, Array]]  # positions over time
-WHEN = itemgetter(0)
+ARRIVAL = itemgetter(0)
 
 
 class _Picture(NamedTuple):
@@ -85,14 +85,14 @@ class _Bag:
 
     def __init__(self, folder: Path, topics: Topics, limits: JointLimits) -> None:
         self.folder, self._limits, self._joint_states = folder, limits, messages.JointStates(limits)
-        self.inputs: list[tuple[float, _Picture | Measured]] = []  # when they arrived
+        self.inputs: list[tuple[float, _Picture | JointMeasurement]] = []  # when they arrived
         self.measured: Track = []  # joints (J,) [rad] and opening [m], together (J + 1,)
         self.commands: Track = []  # (J,) [rad]
         self.openings: Track = []  # commanded, 0 … 1
         self._assignments: list[_Assignment | None] = []  # at every joint state
         self._instruction, self._said_at, self._number = "", -np.inf, 0
         self._used, self._problems = set[str](), dict[str, str]()  # topics; topic → why its first message is unusable
-        with opened(folder) as reader:
+        with open_bag(folder) as reader:
             self.kinds = {connection.topic: connection.msgtype for connection in reader.connections}
             status = next((topic for topic in self.kinds if topic.endswith(STATUS)), None)
             self._has_status = status is not None
@@ -136,56 +136,56 @@ class _Bag:
             times, positions = zip(*(sample for _, sample in group), strict=True)
             start, end = times[0], times[-1]
             if assignment.person:
-                points = np.array(positions) / [*[STILL] * len(self._limits.joints), STILL_OPENING]
+                points = np.array(positions) / [*[REST_MOTION] * len(self._limits.joints), REST_OPENING]
                 left, on_way = (np.flatnonzero(np.abs(points - pose).max(1) > 1) for pose in (points[0], points[-1]))
                 start = max(times[left[0]] - LEAD, start) if len(left) else end
                 end = min(times[on_way[-1]] + LEAD, end) if len(on_way) else start
-            if end - start >= SHORTEST:
+            if end - start >= MIN_SEGMENT:
                 yield _Segment(assignment.instruction, assignment.person, start, end)
 
     def sees(self, camera: str, segment: _Segment) -> bool:
         """Return whether there are images of a camera in a segment."""
-        start = bisect_left(self.inputs, segment.start, key=WHEN)
-        stop = bisect_right(self.inputs, segment.end, key=WHEN)
+        start = bisect_left(self.inputs, segment.start, key=ARRIVAL)
+        stop = bisect_right(self.inputs, segment.end, key=ARRIVAL)
         pictures = (picture for _, picture in self.inputs[start:stop] if isinstance(picture, _Picture))
         return any(picture.camera == camera and picture.taken >= segment.start for picture in pictures)
 
-    def _see(self, camera: str, at: float, message: Any) -> None:
+    def _see(self, camera: str, arrival: float, message: Any) -> None:
         if not hasattr(message, "format"):
             messages.image_from(message)  # compressed ones are decoded when they are needed
-        self.inputs.append((at, _Picture(camera, self._capture_time(at, message))))
+        self.inputs.append((arrival, _Picture(camera, self._capture_time(arrival, message))))
 
-    def _capture_time(self, at: float, message: Any) -> float:
-        """Return when a message's content was captured: its time stamp if plausible, else `at`, when it came."""
+    def _capture_time(self, arrival: float, message: Any) -> float:
+        """Return when a message's content was captured: its time stamp if plausible, else that of its `arrival`."""
         stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-        age = self._start + at - stamp
-        return at - age if stamp and 0 <= age < OLDEST else at
+        age = self._start + arrival - stamp
+        return arrival - age if stamp and 0 <= age < MAX_STAMP_AGE else arrival
 
-    def _measure(self, at: float, message: Any) -> None:
-        stamp = self._capture_time(at, message)
+    def _measure(self, arrival: float, message: Any) -> None:
+        stamp = self._capture_time(arrival, message)
         if (joint_state := self._joint_states.read(message, stamp)) is None:
             raise UserError("they hold the fingers alone")
         stamp = max(stamp, self.measured[-1][0]) if self.measured else stamp
-        self.inputs.append((at, joint_state._replace(at=stamp)))
+        self.inputs.append((arrival, joint_state._replace(stamp=stamp)))
         self.measured.append((stamp, np.append(joint_state.joints, joint_state.opening)))
         assignment = _Assignment(self._number, self._instruction, bool(self._person))
         self._assignments.append(assignment if self._instruction and self._person is not None else None)
 
-    def _instruct(self, at: float, message: Any) -> None:
+    def _instruct(self, arrival: float, message: Any) -> None:
         instruction = message.data.strip()
         if len(message.data) > LONGEST_INSTRUCTION:  # which the node drops
             raise UserError(f"an instruction of {len(message.data)} characters, the limit is {LONGEST_INSTRUCTION}")
         if not instruction and self._has_status:  # which stops the node, and its status tells until when
             return
-        self._number += instruction != self._instruction or at - self._said_at > REPEATED
-        self._instruction, self._said_at = instruction, at
+        self._number += instruction != self._instruction or arrival - self._said_at > REPETITION_TIME
+        self._instruction, self._said_at = instruction, arrival
 
-    def _hand_over(self, at: float, message: Any) -> None:
+    def _hand_over(self, arrival: float, message: Any) -> None:
         values = {pair.key: pair.value for pair in message.values}
         running = False if values.get("state") == State.RUNNING else None
         self._person = True if values.get(messages.HANDED_OVER) == "yes" else running
 
-    def _command(self, at: float, message: Any) -> None:
+    def _command(self, arrival: float, message: Any) -> None:
         """Add a command; one without joint positions is dropped: actions follow the measured motion."""
         if hasattr(message, "points"):  # the node replaces all points after the first by its next trajectory
             names, positions = message.joint_names, message.points[0].positions if message.points else ()
@@ -194,14 +194,14 @@ class _Bag:
         else:
             names, positions = message.name, message.position
         joints, opening = messages.command_from(names, positions, self._limits)
-        self.commands.append((at, joints))
+        self.commands.append((arrival, joints))
         if opening is not None:
-            self.openings.append((at, np.array(opening)))
+            self.openings.append((arrival, np.array(opening)))
 
-    def _command_fingers(self, at: float, message: Any) -> None:
+    def _command_fingers(self, arrival: float, message: Any) -> None:
         if not len(message.data) or not np.isfinite(message.data).all():
             raise UserError("finger positions are missing or not finite")
-        self.openings.append((at, np.mean(message.data) / self._limits.finger_travel))
+        self.openings.append((arrival, np.mean(message.data) / self._limits.finger_travel))
 
 
 class BagDemonstrations(imported.ImportedDemonstrations):
@@ -241,7 +241,7 @@ class BagDemonstrations(imported.ImportedDemonstrations):
             for bag, segment, steps in self._episodes
         ]
         actions = np.concatenate(self._actions)
-        if problems := imported.out_of_bounds(actions, spec, MOSTLY):
+        if problems := imported.out_of_bounds(actions, spec, MAX_OUTSIDE_SHARE):
             raise UserError(f"{folder} does not match the task: {'; '.join(problems)}")
         imported.log_clipped(actions, spec)
 
@@ -285,19 +285,19 @@ class BagDemonstrations(imported.ImportedDemonstrations):
     def _steps(self, bag: _Bag, segment: _Segment) -> list[_Step]:
         """Return the steps of a segment, made as the policy node makes observations; raise a UserError without any."""
         observer, steps, period = Observer(self.spec), list[_Step](), 1 / self.spec.control_hz
-        start = bisect_left(bag.inputs, segment.start - HISTORY, key=WHEN)
-        stop = bisect_right(bag.inputs, segment.end, key=WHEN)
+        start = bisect_left(bag.inputs, segment.start - HISTORY, key=ARRIVAL)
+        stop = bisect_right(bag.inputs, segment.end, key=ARRIVAL)
         last, nominal, longest = -np.inf, -np.inf, 0.0  # time of the last step, due time of the next, longest gap [s]
         for arrival, item in bag.inputs[start:stop]:
-            if isinstance(item, Measured):
+            if isinstance(item, JointMeasurement):
                 observer.add_joint_state(item)
                 continue
             observer.add_image(item.camera, np.array(arrival), item.taken)
-            time = observer.due(last, nominal)
-            if time is None or observer.newest is None or not segment.start <= time <= segment.end - period:
+            time = observer.new_image_time(last, nominal)
+            if time is None or observer.newest_joint_state is None or not segment.start <= time <= segment.end - period:
                 continue
-            joint_state = observer.measured_at(time)
-            if abs(joint_state.at - time) <= MEASURED_WITHIN:
+            joint_state = observer.joint_state_at(time)
+            if abs(joint_state.stamp - time) <= MAX_JOINT_STATE_GAP:
                 longest = max(longest, time - last if steps else 0.0)
                 # Early images must not make all later steps early, too.
                 last, nominal = time, (time if time - nominal > period / 2 else nominal) + period
@@ -305,7 +305,7 @@ class BagDemonstrations(imported.ImportedDemonstrations):
                 steps.append(_Step(time, arrivals, observer.state(joint_state)))
         if not steps:
             raise UserError(f"{bag.folder} has no matching images of {', '.join(self.spec.cameras)} in {segment}")
-        if longest > LATE * period:
+        if longest > MAX_STEP_GAP * period:
             reason = "images or joint states are missing, or do not match"
             log.warning("%s: no step for up to %.2f s in %s: %s", bag.folder, longest, segment, reason)
         return steps
@@ -315,7 +315,7 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         keys = {key for step in steps for key in step.arrivals.items()}
         first, last = (choose(arrival for _, arrival in keys) for choose in (min, max))
         images = dict[tuple[str, float], Array]()
-        with opened(bag.folder) as reader:
+        with open_bag(bag.folder) as reader:
             start = reader.start_time
             span = start + round(first * 1e9), start + round(last * 1e9) + 1
             for topic, stamp, message in messages_of(reader, self._cameras, bag.folder, *span):
@@ -324,30 +324,30 @@ class BagDemonstrations(imported.ImportedDemonstrations):
                         images[key] = resize(messages.image_from(message), self.spec.image_size)
         return images
 
-    def _action(self, bag: _Bag, segment: _Segment, at: float) -> Array:
-        """Return the (D,) motion from `at` over one control period."""
-        end, joints = at + 1 / self.spec.control_hz, len(self._limits.joints)
-        track = bag.commands if _covers(bag.commands, at) and _covers(bag.commands, end) else bag.measured
-        motion = self._controller.motion_between(*(_interpolate(track, time)[:joints] for time in (at, end)))
+    def _action(self, bag: _Bag, segment: _Segment, start: float) -> Array:
+        """Return the (D,) motion from `start` over one control period."""
+        end, joints = start + 1 / self.spec.control_hz, len(self._limits.joints)
+        track = bag.commands if _covers(bag.commands, start) and _covers(bag.commands, end) else bag.measured
+        motion = self._controller.motion_between(*(_interpolate(track, time)[:joints] for time in (start, end)))
         if self._gripper is None:
             return motion
-        openings = bag.openings[: bisect_right(bag.openings, end, key=WHEN)][-1:]
+        openings = bag.openings[: bisect_right(bag.openings, end, key=ARRIVAL)][-1:]
         if openings and openings[0][0] >= segment.start:  # an earlier command was the policy's, not the person's
             return np.insert(motion, self._gripper, openings[0][1])
         return np.insert(motion, self._gripper, _interpolate(bag.measured, end)[joints] / self._limits.stroke)
 
 
-def _covers(track: Track, at: float) -> bool:
-    """Return whether there are positions shortly before and shortly after `at`."""
-    place = bisect_right(track, at, key=WHEN)
+def _covers(track: Track, time: float) -> bool:
+    """Return whether there are positions shortly before and shortly after `time`."""
+    place = bisect_right(track, time, key=ARRIVAL)
     return 0 < place < len(track) and track[place][0] - track[place - 1][0] <= GAP
 
 
-def _interpolate(track: Track, at: float) -> Array:
+def _interpolate(track: Track, time: float) -> Array:
     """Interpolate linearly."""
-    index = min(bisect_left(track, at, key=WHEN), len(track) - 1)
+    index = min(bisect_left(track, time, key=ARRIVAL), len(track) - 1)
     (begin, start), (end, stop) = track[max(index - 1, 0)], track[index]
-    return start + min(max((at - begin) / max(end - begin, 1e-9), 0.0), 1.0) * (stop - start)
+    return start + min(max((time - begin) / max(end - begin, 1e-9), 0.0), 1.0) * (stop - start)
 
 
 def _read_bags(folder: Path | str | None, topics: Topics, limits: JointLimits) -> list[_Bag]:

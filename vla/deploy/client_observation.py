@@ -11,7 +11,7 @@ from annotated_types import MinLen
 
 from vla.io.errors import UserError
 from vla.io.types import Text
-from vla.spec import LONGEST_INSTRUCTION, Array, Observation, Running, Spec
+from vla.spec import LONGEST_INSTRUCTION, Array, Observation, RunningPlan, Spec
 
 LARGEST_IMAGE = 4096  # pixels in a row or column
 
@@ -26,7 +26,7 @@ class Keys:
 
     def cameras(self, spec: Spec) -> dict[str, str]:
         """Return the cameras whose images are to be sent, with their keys."""
-        return {camera: self.images.get(camera, camera) for camera in spec.given(self.images)}
+        return {camera: self.images.get(camera, camera) for camera in spec.required_images(self.images)}
 
     def observation(self, message: Any, spec: Spec) -> Observation:
         """Convert a client's observation, with images of any size; raise a UserError if it does not match the spec."""
@@ -91,7 +91,7 @@ def _vector(key: str, value: Any) -> Array:
     return vector
 
 
-def _running(value: Any, spec: Spec) -> Running | None:
+def _running(value: Any, spec: Spec) -> RunningPlan | None:
     """Return the rest of the plan that a client executes."""
     if value is None:
         return None
@@ -101,7 +101,7 @@ def _running(value: Any, spec: Spec) -> Running | None:
         raise UserError(f"running/actions must be a plan (n, {width}), got {getattr(actions, 'shape', None)}")
     if type(delay) is not int or not 0 <= delay <= len(actions):
         raise UserError(f"running/delay is {repr(delay)[:50]}, expected an integer from 0 to {len(actions)}")
-    return Running(_vector("running/actions", actions).reshape(actions.shape), delay)
+    return RunningPlan(_vector("running/actions", actions).reshape(actions.shape), delay)
 
 
 def instruction(key: str, value: Any) -> str:

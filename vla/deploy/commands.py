@@ -18,9 +18,9 @@ from vla.deploy.motion import Command
 from vla.deploy.settings import FOLLOW, PolicySettings, action_class
 
 # Time of a plan in every trajectory [s]: the next tick replaces it, and computing all of a long plan outlasts a tick.
-AHEAD = 0.3
+LOOK_AHEAD = 0.3
 CLOSE_BELOW, OPEN_ABOVE = 0.4, 0.6  # commanded opening of a gripper at which its goal changes
-REPLACED = (0, -1)  # error codes of FollowJointTrajectory for a goal that another one has replaced
+REPLACEMENT_CODES = (0, -1)  # error codes of FollowJointTrajectory for a goal that another one has replaced
 
 
 class ArmOutput:
@@ -57,7 +57,9 @@ class ArmOutput:
 
     def _trajectory(self, command: Command, now: float) -> JointTrajectory:
         """A trajectory that the next one replaces."""
-        return trajectory(self._loop.limits, self._loop.motion.ahead(command, now, AHEAD), self._loop.tick)
+        return trajectory(
+            self._loop.limits, self._loop.motion.trajectory_to_rest(command, now, LOOK_AHEAD), self._loop.tick
+        )
 
     def _positions(self, command: Command, now: float) -> Float64MultiArray:
         return Float64MultiArray(data=command.position.tolist())
@@ -133,6 +135,6 @@ def trajectory(limits: JointLimits, commands: Sequence[Command], tick: float) ->
 
 def _trajectory_complaint(result: Any, replaced: bool) -> str:
     """Describe a result of FollowJointTrajectory; empty if its goal was replaced and that is all."""
-    if replaced and result.error_code in REPLACED:
+    if replaced and result.error_code in REPLACEMENT_CODES:
         return ""
     return ", ".join(filter(None, (f"error code {result.error_code}", result.error_string)))

@@ -11,18 +11,18 @@ import numpy as np
 
 from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.motion import Command, Goals, Motion
-from vla.deploy.observer import Measured, Observer
+from vla.deploy.observer import JointMeasurement, Observer
 from vla.deploy.safety import Safety, State, Tracking
 from vla.io.errors import UserError
 from vla.schedule import Delays
-from vla.spec import Array, Observation, Running, Spec
+from vla.spec import Array, Observation, RunningPlan, Spec
 
 # How to recover, for messages.
 RESUME = 'python -m vla.deploy.say --resume "INSTRUCTION", or call ~/resume'
 RESTART = "deactivate and activate the agent, or start it again"
 HAND_BACK = "python -m vla.deploy.say --hand-back, or call ~/hand_over with false"
-REPEATED = 2.0  # an equal instruction within this time is a repetition, as `ros2 topic pub` sends them [s]
-STILL, STILL_FOR = 0.005, 0.2  # an arm that has moved less [rad] for so long [s] is at rest
+REPETITION_TIME = 2.0  # an equal instruction within this time is a repetition, as `ros2 topic pub` sends them [s]
+REST_MOTION, REST_TIME = 0.005, 0.2  # an arm that has moved less [rad] for so long [s] is at rest
 
 
 @dataclass
@@ -78,15 +78,15 @@ class ControlLoop:
         self._request: _Request | None = None
         self._planned = np.empty((0, len(self.spec.action)), np.float32)  # the actions in the schedule
         self.delays = Delays(1 / self.spec.control_hz)  # from observations to their plans
-        self.observed_at = -np.inf  # time stamp of the last observation
+        self.observation_time = -np.inf  # time stamp of the last observation
         self.resumed = True  # True if the last observation is the first since the loop started to run
-        self._last_observed = -np.inf  # as `observed_at`, but reset whenever the loop stops running
+        self._last_observed = -np.inf  # as `observation_time`, but reset whenever the loop stops running
         self._timed_out = False  # True if the loop is stopped by a time-out
 
     def on_instruction(self, instruction: str, now: float) -> bool:
         """Set the instruction, which also ends a stop by time-out; an empty one stops the arm.
 
-        An equal one within `REPEATED` of the last is a repetition and changes nothing.
+        An equal one within `REPETITION_TIME` of the last is a repetition and changes nothing.
 
         Returns whether the instruction is executed: not after any other stop, nor after a fault.
         """
@@ -94,7 +94,7 @@ class ControlLoop:
         if not instruction:
             self.stop("the instruction is empty")
             return False
-        is_repetition = instruction == self.instruction and now - self._said_at < REPEATED
+        is_repetition = instruction == self.instruction and now - self._said_at < REPETITION_TIME
         self._said_at = now
         if not is_repetition:
             self.instruction, self._instructed_at = instruction, now
@@ -126,10 +126,10 @@ class ControlLoop:
     def take_back(self, now: float) -> None:
         """Command the arm again, from its measured pose; the gripper stays as it is until the policy moves it. Raises a
         UserError if the arm moves, is outside its limits, or has no recent joint state; the person then keeps it."""
-        joint_state = self.observer.newest
+        joint_state = self.observer.newest_joint_state
         if (problem := self._joints_problem(now)) or joint_state is None:
             raise UserError(problem)
-        if self.observer.moved(STILL_FOR) > STILL:
+        if self.observer.displacement(REST_TIME) > REST_MOTION:
             raise UserError("the arm still moves: let it rest first")
         self.motion.start(joint_state.joints, None, now)
         self._tracking = Tracking(self.safety, self._follows_positions)
@@ -156,24 +156,26 @@ class ControlLoop:
     def next_observation(self, now: float) -> Observation | None:
         """Return the observation for the policy if an inference is due; then call `set_plan` or `reject_plan`."""
         schedule = self.motion.schedule
-        image_time = self.observer.due(
-            self._last_observed, schedule.end if self._execute is None else schedule.executed(self._execute)
+        image_time = self.observer.new_image_time(
+            self._last_observed, schedule.end if self._execute is None else schedule.execution_end(self._execute)
         )
         if self.state is not State.RUNNING or self._request is not None or image_time is None:
             return None
-        if schedule.newest and now > schedule.end + 0.5 / self.spec.control_hz:
+        if schedule.newest_plan and now > schedule.end + 0.5 / self.spec.control_hz:
             self.late_plans += 1
         # Anchor on the pose commanded at that time. The measured pose lags behind it; the last goal runs ahead of an
         # arm that its limits slow down, and the policy would overshoot.
-        measured = self.observer.measured_at(image_time)
-        anchor = self.motion.commanded_at(image_time) if self._follows_positions else measured.joints
-        self.resumed, self._last_observed, self.observed_at = np.isinf(self._last_observed), image_time, image_time
+        measured = self.observer.joint_state_at(image_time)
+        anchor = self.motion.commanded_joints(image_time) if self._follows_positions else measured.joints
+        self.resumed, self._last_observed, self.observation_time = np.isinf(self._last_observed), image_time, image_time
         self._request = _Request(now, image_time, anchor)
         observation = Observation(self.observer.images, self.observer.state(measured), self.instruction)
-        steps_left = len(schedule.remaining(image_time + 0.5 / self.spec.control_hz))  # an image may be early
+        steps_left = len(schedule.remaining_actions(image_time + 0.5 / self.spec.control_hz))  # an image may be early
         if self._execute is None or not steps_left:
             return observation
-        return replace(observation, running=Running(self._planned[-steps_left:], min(self.delays.longest, steps_left)))
+        return replace(
+            observation, running=RunningPlan(self._planned[-steps_left:], min(self.delays.forecast, steps_left))
+        )
 
     def set_plan(self, actions: Array) -> bool:
         """Schedule the policy's actions (k, D); the first one starts at the time of the observation.
@@ -186,14 +188,14 @@ class ControlLoop:
         if request is None:  # the arm has been handed over in the meantime
             return False
         try:
-            waypoints = self.goals.of(actions, request.observed, request.anchor)
+            waypoints = self.goals.waypoints(actions, request.observed, request.anchor)
         except UserError as error:
             self._count_rejection(str(error))
             return False
         if follows := self.state is State.RUNNING and not request.outdated:
             self.rejections, self._planned = 0, actions
             # An arm that does not follow its commands is where it is measured, not where it was commanded.
-            joint_state = None if self._follows_positions else self.observer.newest
+            joint_state = None if self._follows_positions else self.observer.newest_joint_state
             self.motion.follow(waypoints, None if joint_state is None else joint_state.joints)
         return follows
 
@@ -220,11 +222,11 @@ class ControlLoop:
     @property
     def acting(self) -> bool:
         """Whether the arm executes actions of the policy."""
-        return self.motion.schedule.newest is not None
+        return self.motion.schedule.newest_plan is not None
 
     def _supervise(self, now: float) -> None:
         """Change the state if an input is missing, late or invalid, or fresh again."""
-        joint_state = self.observer.newest
+        joint_state = self.observer.newest_joint_state
         if joint_state is None:
             return
         if not self.motion.started and self.state is not State.FAULT:  # after which a person must inspect the arm
@@ -248,12 +250,12 @@ class ControlLoop:
             self._timed_out = True
         elif problem := self._input_problem(joint_state, now):
             # A held arm moves again only after consecutive fresh frames.
-            self.observer.fresh = 0
+            self.observer.fresh_sets = 0
             self._set_state(State.HOLDING if self.state is State.RUNNING else self.state, problem)
-        elif self.state is State.WAITING or self.observer.fresh >= self.safety.fresh_frames:
+        elif self.state is State.WAITING or self.observer.fresh_sets >= self.safety.fresh_frames:
             self._set_state(State.RUNNING, "")
 
-    def _take_over(self, state: Measured, now: float) -> None:
+    def _take_over(self, state: JointMeasurement, now: float) -> None:
         """Make the measured pose the first commanded one."""
         try:
             self.motion.start(state.joints, float(np.clip(state.opening / self.limits.stroke, 0.0, 1.0)), now)
@@ -263,10 +265,10 @@ class ControlLoop:
     @property
     def _must_stay(self) -> bool:
         """Whether the arm is to stay where it is; after a fault it may still be on its way to rest."""
-        resting = self.motion.limiter.resting and self.observer.moved(STILL_FOR) <= STILL
+        resting = self.motion.limiter.resting and self.observer.displacement(REST_TIME) <= REST_MOTION
         return self.state is State.STOPPED or (self.state is State.FAULT and resting)
 
-    def _input_problem(self, joint_state: Measured, now: float) -> str:
+    def _input_problem(self, joint_state: JointMeasurement, now: float) -> str:
         """Describe which input or inference is overdue; empty if none is."""
         if problem := self.obstacle or self.observer.image_problem(now, self.safety.image_age):
             return problem
@@ -278,15 +280,15 @@ class ControlLoop:
 
     def _joints_problem(self, now: float) -> str:
         """Say that the newest joint state is too old, or that there is none; empty if it is recent."""
-        joint_state = self.observer.newest
-        is_recent = joint_state is not None and now - joint_state.at <= self.safety.joints_age
+        joint_state = self.observer.newest_joint_state
+        is_recent = joint_state is not None and now - joint_state.stamp <= self.safety.joints_age
         return "" if is_recent else f"no joint state within the last {self.safety.joints_age} s"
 
     def _set_state(self, state: State, reason: str) -> None:
         if state is not self.state:
             self._drop_plans()
             if state is not State.RUNNING:  # when it runs again, the policy begins anew with the newest frame
-                self.observer.fresh, self._last_observed = 0, -np.inf
+                self.observer.fresh_sets, self._last_observed = 0, -np.inf
         self.state, self.reason = state, reason
 
     def _drop_plans(self) -> None:

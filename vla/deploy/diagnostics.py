@@ -14,7 +14,7 @@ from vla.deploy.messages import HANDED_OVER, shorten
 from vla.deploy.safety import State
 
 LEVELS = dict.fromkeys((State.HOLDING, State.STOPPED), DiagnosticStatus.WARN) | {State.FAULT: DiagnosticStatus.ERROR}
-RECENT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # also for late subscribers
+RECENT_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # also for late subscribers
 MAX_MESSAGE = 300  # length of a log line or status message [characters]
 
 
@@ -23,7 +23,7 @@ class Diagnostics:
 
     def __init__(self, node: GuardedLifecycleNode, loop: ControlLoop, dry_run: bool) -> None:
         self._node, self._loop, self._dry_run, self._drop_count = node, loop, dry_run, 0
-        self._status = node.add_publisher(DiagnosticStatus, "~/status", qos=RECENT)
+        self._status = node.add_publisher(DiagnosticStatus, "~/status", qos=RECENT_QOS)
         self._array = node.add_publisher(DiagnosticArray, "/diagnostics")
         self._latencies: dict[str, deque[float]] = {}
         self._reported_state: tuple[State | None, str] = (None, "")

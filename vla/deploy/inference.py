@@ -37,9 +37,9 @@ class Inference:
         self._policy.reset("", 0)
         self._episodes = count()
 
-    def start(self, observation: Observation, first: bool) -> None:
-        """Start an inference; `first` begins an episode."""
-        self._running = self._pool.submit(self._plan, observation, first)
+    def start(self, observation: Observation, is_first: bool) -> None:
+        """Start an inference; `is_first` begins an episode."""
+        self._running = self._pool.submit(self._plan, observation, is_first)
 
     def take(self) -> tuple[Array, float] | None:
         """Return actions (k, D) to execute, and the duration [s], of an inference that is done, or raise its error."""
@@ -62,10 +62,10 @@ class Inference:
             self._policy.reset(observation.instruction, next(self._episodes))
         plan = self._policy.plan(observation)
         # A plan that the next one continues is executed until that one arrives.
-        actions = plan if getattr(self._policy, "chunking", None) else plan[: executed(self._policy)]
+        actions = plan if getattr(self._policy, "chunking", None) else plan[: actions_per_plan(self._policy)]
         return actions, time.monotonic() - start
 
 
-def executed(policy: Policy) -> int:
+def actions_per_plan(policy: Policy) -> int:
     """Return how many actions of a plan are executed: one with a history, as in training its frames have no gaps."""
     return 1 if getattr(policy, "history", 1) > 1 else int(policy.execute)

@@ -15,11 +15,11 @@ import numpy as np
 from annotated_types import MaxLen
 
 from vla.deploy.joint_limiter import JointLimits
-from vla.deploy.observer import Measured
+from vla.deploy.observer import JointMeasurement
 from vla.io.documents import STRICT, parse_json
 from vla.io.errors import UserError
 from vla.io.images import decode_image
-from vla.io.printable import printable
+from vla.io.printable import escape
 from vla.io.types import Natural, NonNegative, Seed
 from vla.spec import LONGEST_INSTRUCTION, Array, Name
 
@@ -32,9 +32,9 @@ ENCODINGS = {
 }
 
 HANDED_OVER = "handed over"  # in the agent's status: yes if a person moves the arm, and in a dry run; else no
-LONGEST = 100_000  # characters of a message about an episode
+MAX_EPISODE_CHARACTERS = 100_000  # characters of a message about an episode
 FINGERS_AGE = 0.5  # oldest state of fingers that come in messages of their own [s]
-BEYOND = 0.5  # distance outside its limits at which an arm moved by a person may still be [rad]
+LIMIT_TOLERANCE = 0.5  # distance outside its limits at which an arm moved by a person may still be [rad]
 
 
 @dataclass(frozen=True)
@@ -53,15 +53,15 @@ class SimulatedEpisode:
     milestones: Annotated[tuple[Name, ...], MaxLen(100)]
 
     @classmethod
-    def of(cls, message: Any) -> SimulatedEpisode:
+    def from_message(cls, message: Any) -> SimulatedEpisode:
         """Read a std_msgs/String; raise a UserError if it is no episode."""
-        return parse_json(message.data[:LONGEST], cls, "/vla_simulator/episode")
+        return parse_json(message.data[:MAX_EPISODE_CHARACTERS], cls, "/vla_simulator/episode")
 
 
-def shorten(text: str, longest: int = 80) -> str:
-    """Truncate text to at most `longest` characters, printable for logs."""
-    text = printable(text)
-    return text if len(text) <= longest else f"{text[: longest - 1]}…"
+def shorten(text: str, max_length: int = 80) -> str:
+    """Truncate text to at most `max_length` characters, printable for logs."""
+    text = escape(text)
+    return text if len(text) <= max_length else f"{text[: max_length - 1]}…"
 
 
 def image_from(message: Any) -> Array:
@@ -95,7 +95,7 @@ class JointStates:
         """Args: the limits, of which names and positions are used."""
         self._limits, self._fingers = limits, (-np.inf, 0.0)  # when they came, opening
 
-    def read(self, message: Any, at: float) -> Measured | None:
+    def read(self, message: Any, stamp: float) -> JointMeasurement | None:
         """Return the joint state in a sensor_msgs/JointState.
 
         Joints are found by name. Missing velocities, also NaN, become zero. A message with only the fingers returns
@@ -104,24 +104,24 @@ class JointStates:
 
         Args:
             message: the message.
-            at: when it was captured [s].
+            stamp: when it was captured [s].
         """
         arm, fingers, names = self._limits.joints, self._limits.fingers, {*message.name}
         fingers_only = names >= {*fingers} and names.isdisjoint(arm)  # which may have further joints
         if fingers and fingers_only and len(names) < len(fingers) + len(arm):
-            self._fingers = (at, float(_positions(message, fingers)[0].sum()))
+            self._fingers = (stamp, float(_positions(message, fingers)[0].sum()))
             return None
-        if at - self._fingers[0] <= FINGERS_AGE and names.isdisjoint(fingers):
+        if stamp - self._fingers[0] <= FINGERS_AGE and names.isdisjoint(fingers):
             position, velocity = _positions(message, arm)
             opening = self._fingers[1]
         else:
             position, velocity = _positions(message, [*arm, *fingers])
             opening = float(position[len(arm) :].sum())
         place, low, high = position[: len(arm)], np.array(self._limits.low), np.array(self._limits.high)
-        if (violations := (place < low - BEYOND) | (place > high + BEYOND)).any():
+        if (violations := (place < low - LIMIT_TOLERANCE) | (place > high + LIMIT_TOLERANCE)).any():
             joint = int(np.argmax(violations))
             raise UserError(f"joint state has {arm[joint]} at {place[joint]:g} rad, where this arm cannot be")
-        return Measured(at, place, velocity[: len(arm)], opening)
+        return JointMeasurement(stamp, place, velocity[: len(arm)], opening)
 
 
 def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:

@@ -97,7 +97,7 @@ class Goals:
         if isinstance(controller, CartesianController):
             self.workspace = _Workspace(controller.arm.forward, controller.low, controller.high)
 
-    def of(self, actions: Array, observed: float, anchor: Array) -> list[Waypoint]:
+    def waypoints(self, actions: Array, observation_time: float, anchor: Array) -> list[Waypoint]:
         """Return the goals of actions (k, D); the first one begins at the time of the observation.
 
         Cartesian actions are relative to the last goal, the first to the joints `anchor` (J,); joint positions are not.
@@ -108,7 +108,7 @@ class Goals:
         if not np.isfinite(actions).all():
             raise UserError("the policy returned numbers that are not finite")
         actions = np.clip(actions, self._spec.low, self._spec.high)
-        ends = observed + np.arange(1, len(actions) + 1) / self._spec.control_hz
+        ends = observation_time + np.arange(1, len(actions) + 1) / self._spec.control_hz
         openings = [None] * len(actions)
         if self._gripper is not None:  # bounds that follow from data may be beyond 0 and 1
             openings = np.clip(actions[:, self._gripper], 0, 1).tolist()
@@ -158,9 +158,9 @@ class Motion:
         if plan:
             self.schedule.add(plan, plan[0][0] - self._period)
 
-    def commanded_at(self, at: float) -> Array:
+    def commanded_joints(self, time: float) -> Array:
         """Return the joints (J,) that were commanded nearest to a time."""
-        return min(self._commanded, key=lambda command: abs(command[0] - at))[1]
+        return min(self._commanded, key=lambda command: abs(command[0] - time))[1]
 
     def advance(self, now: float) -> Command:
         """Return the command of this tick."""
@@ -179,11 +179,11 @@ class Motion:
         """
         if self._sent_valid:
             return None
-        trajectory = self.ahead(command, now)
+        trajectory = self.trajectory_to_rest(command, now)
         self._sent_valid = True
         return trajectory
 
-    def ahead(self, command: Command, now: float, longest: float = math.inf) -> list[Command]:
+    def trajectory_to_rest(self, command: Command, now: float, max_time: float = math.inf) -> list[Command]:
         """Return the trajectory from this command to rest, which the arm follows until it is sent another one.
 
         The next command continues from where the arm is on it by then, even if that tick is late.
@@ -191,10 +191,10 @@ class Motion:
         Args:
             command: of this tick.
             now: the time of this tick [s].
-            longest: time [s] after which the arm brakes, if the schedule has not ended before.
+            max_time: time [s] after which the arm brakes, if the schedule has not ended before.
         """
         limiter, opening = copy.copy(self.limiter), self._opening
-        trajectory, time, end = [command], now, min(now + longest, self.schedule.end)
+        trajectory, time, end = [command], now, min(now + max_time, self.schedule.end)
         while time < end:
             time += self.tick
             opening = self._step(limiter, time, opening)
@@ -205,25 +205,25 @@ class Motion:
         self._sent_trajectory = now, [self._last_command, *trajectory]
         return trajectory
 
-    def _recall(self, since: float, ahead: list[Command], now: float) -> None:
-        """Set the commanded state from the trajectory `ahead`, sent at `since`: the arm follows that anyway.
+    def _recall(self, since: float, trajectory: list[Command], now: float) -> None:
+        """Set the commanded state from the `trajectory` sent at `since`: the arm follows that anyway.
 
         It is the state of this tick while the trajectory is valid, else of the previous one, because a step follows.
         """
-        ticks = min(max(round((now - since) / self.tick, 6) + self._sent_valid, 0.0), len(ahead) - 1.0)
-        start, end, share = ahead[math.floor(ticks)], ahead[math.ceil(ticks)], ticks % 1
+        ticks = min(max(round((now - since) / self.tick, 6) + self._sent_valid, 0.0), len(trajectory) - 1.0)
+        start, end, share = trajectory[math.floor(ticks)], trajectory[math.ceil(ticks)], ticks % 1
         self.limiter.position = start.position + share * (end.position - start.position)
         self.limiter.velocity = end.velocity.copy()  # with which a command is approached
         self._opening = start.opening
 
     def _step(self, limiter: JointLimiter, now: float, opening: float | None) -> float | None:
         """Move towards the next goal within limits and workspace, or brake; returns the opening to command."""
-        plan = self.schedule.newest
+        plan = self.schedule.newest_plan
         if plan is None:
             limiter.brake()
             return opening
         # Goals that are already due are skipped, but the last one is held until the next plan.
-        end, goal, opening = (self.schedule.at(now) or [plan.actions[-1]])[-1]
+        end, goal, opening = (self.schedule.actions_at(now) or [plan.actions[-1]])[-1]
         if self._workspace is None:
             limiter.step(goal, end - now)
         else:

@@ -16,14 +16,14 @@ from vla.spec import Array, Spec
 
 EARLY_SHARE = 0.25  # share of a control period by which an image may precede the next planned observation
 HISTORY = 1.0  # duration of the history of joint states [s]
-OLDEST = 10.0  # age above which a time stamp is taken for that of another clock [s]
+MAX_STAMP_AGE = 10.0  # age above which a time stamp is taken for that of another clock [s]
 MAX_SKEW = 0.05  # largest difference between the time stamps of one set of images [s]
 
 
-class Measured(NamedTuple):
+class JointMeasurement(NamedTuple):
     """A joint state."""
 
-    at: float
+    stamp: float
     joints: Array  # (J,) [rad]
     velocities: Array  # (J,) [rad/s]
     opening: float  # of the gripper [m]
@@ -45,35 +45,35 @@ class Observer:
         if extra_names := [name for name in spec.state if name not in self._model.components]:
             raise UserError(f"the policy's state has {', '.join(extra_names)}, which joint states do not contain")
         self._factors = np.array([UNITS.get(unit.removesuffix("/s"), 1.0) for unit in spec.state_units])
-        self.fresh = 0  # matching sets since the last reset to 0, each with a newer image of every camera
+        self.fresh_sets = 0  # matching sets since the last reset to 0, each with a newer image of every camera
         self._newest: dict[str, tuple[float, Array]] = {}  # camera → time stamp and image
         self._counted_stamps: dict[str, float] = {}  # camera → time stamp of its image in the last counted set
         self._matched_at = -np.inf  # newest time stamp in the last matching set
-        self._joint_states: deque[Measured] = deque()
+        self._joint_states: deque[JointMeasurement] = deque()
 
-    def add_image(self, camera: str, image: Array, at: float) -> None:
-        """Add an image (H, W, 3) uint8 that was taken at `at`."""
-        self._newest[camera] = (at, image)
-        if self.taken_at is None:
+    def add_image(self, camera: str, image: Array, stamp: float) -> None:
+        """Add an image (H, W, 3) uint8 that was taken at `stamp`."""
+        self._newest[camera] = (stamp, image)
+        if self.image_time is None:
             return
         times = {name: self._newest[name][0] for name in self._spec.cameras}
         self._matched_at = max(times.values())
         if all(time > self._counted_stamps.get(name, -np.inf) for name, time in times.items()):
-            self.fresh, self._counted_stamps = self.fresh + 1, times
+            self.fresh_sets, self._counted_stamps = self.fresh_sets + 1, times
 
-    def add_joint_state(self, measured: Measured) -> None:
+    def add_joint_state(self, measured: JointMeasurement) -> None:
         """Add a joint state."""
         self._joint_states.append(measured)
-        while self._joint_states[0].at < measured.at - HISTORY:
+        while self._joint_states[0].stamp < measured.stamp - HISTORY:
             self._joint_states.popleft()
 
     @property
-    def newest(self) -> Measured | None:
+    def newest_joint_state(self) -> JointMeasurement | None:
         """The newest joint state."""
         return self._joint_states[-1] if self._joint_states else None
 
     @property
-    def taken_at(self) -> float | None:
+    def image_time(self) -> float | None:
         """Oldest time stamp of the newest images; None if these do not form a matching set."""
         if any(camera not in self._newest for camera in self._spec.cameras):
             return None
@@ -96,21 +96,23 @@ class Observer:
             return f"the images of {', '.join(self._spec.cameras)} are more than {MAX_SKEW} s apart"
         return ""
 
-    def moved(self, seconds: float) -> float:
+    def displacement(self, seconds: float) -> float:
         """Return how far a joint has moved within the last `seconds` of the history [rad]."""
-        positions = [state.joints for state in self._joint_states if state.at >= self._joint_states[-1].at - seconds]
+        positions = [
+            state.joints for state in self._joint_states if state.stamp >= self._joint_states[-1].stamp - seconds
+        ]
         return float(np.ptp(positions, axis=0).max()) if positions else 0.0
 
-    def due(self, after: float, earliest: float) -> float | None:
-        """Return when the newest images were taken; None unless they match, after `after`, about from `earliest` on."""
-        time, slack = self.taken_at, EARLY_SHARE / self._spec.control_hz
-        return None if time is None or time <= after or time < earliest - slack else time
+    def new_image_time(self, previous: float, earliest: float) -> float | None:
+        """Return when the newest images were taken; None unless they match, after `previous`, from about `earliest`."""
+        time, slack = self.image_time, EARLY_SHARE / self._spec.control_hz
+        return None if time is None or time <= previous or time < earliest - slack else time
 
-    def measured_at(self, at: float) -> Measured:
-        """Return the joint state nearest to `at` in the history."""
-        return min(self._joint_states, key=lambda state: abs(state.at - at))
+    def joint_state_at(self, stamp: float) -> JointMeasurement:
+        """Return the joint state nearest to `stamp` in the history."""
+        return min(self._joint_states, key=lambda state: abs(state.stamp - stamp))
 
-    def state(self, measured: Measured) -> Array:
+    def state(self, measured: JointMeasurement) -> Array:
         """Return the robot state (P,) float32 in the order and units of the spec."""
         values = dict(zip(self._model.joints, measured.joints, strict=True))
         values |= dict(zip(self._model.velocities, measured.velocities, strict=False))

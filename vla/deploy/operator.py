@@ -18,7 +18,7 @@ from rclpy.duration import Duration
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from vla.deploy.lifecycle_node import LATCHED
+from vla.deploy.lifecycle_node import LATCHED_QOS
 from vla.deploy.messages import SimulatedEpisode
 from vla.io.errors import UserError
 from vla.rollouts.motion import Motion
@@ -27,7 +27,7 @@ from vla.rollouts.results import Result
 log = logging.getLogger(__name__)
 
 TIMEOUT = 10.0  # of the discovery of a subscriber or service, of a service call, and of a status [s]
-SETTLED = 0.7  # discovery is complete after so long without a new subscriber [s]
+SETTLING_TIME = 0.7  # discovery is complete after so long without a new subscriber [s]
 START = 60.0  # longest start of both nodes of the demo [s]
 AGENT, SIMULATOR = "/vla_agent", "/vla_simulator"
 
@@ -46,23 +46,23 @@ class Operator:
         self.node, self._processes = node, processes
         self._words = node.create_publisher(String, topic, 1)
         self.status: DiagnosticStatus | None = None  # newest of the agent
-        node.create_subscription(DiagnosticStatus, f"{AGENT}/status", self._on_status, LATCHED)
+        node.create_subscription(DiagnosticStatus, f"{AGENT}/status", self._on_status, LATCHED_QOS)
 
     @property
     def values(self) -> dict[str, str]:
         """Name → value in the newest status."""
         return {pair.key: pair.value for pair in self.status.values} if self.status else {}
 
-    def wait(self, condition: Callable[[], bool], what: str, seconds: float = TIMEOUT) -> None:
-        """Spin until the condition `what` holds, for at most some seconds."""
+    def wait(self, condition: Callable[[], bool], description: str, seconds: float = TIMEOUT) -> None:
+        """Spin until a condition holds, of which there is a `description`, for at most some seconds."""
         deadline = time.monotonic() + seconds
         while not condition():
             if not all(process.is_alive() for process in self._processes):
                 raise UserError("a node has exited, see its log above")
             if time.monotonic() > deadline:
                 raise UserError(
-                    f"timed out after {seconds:g} s, waiting for {what}: is its node running, and on the same network "
-                    "and domain?"
+                    f"timed out after {seconds:g} s, waiting for {description}: is its node running, and on the same "
+                    "network and domain?"
                 )
             rclpy.spin_once(self.node, timeout_sec=0.02)
 
@@ -85,7 +85,7 @@ class Operator:
             nonlocal found, since
             if (count := self._words.get_subscription_count()) != found:
                 found, since = count, time.monotonic()
-            return found > 0 and time.monotonic() - since > SETTLED
+            return found > 0 and time.monotonic() - since > SETTLING_TIME
 
         self.wait(settled, f"a subscriber on {self._words.topic_name}")
         self._words.publish(String(data=instruction))
@@ -112,7 +112,7 @@ class Operator:
         The agent then waits for an instruction. Returns the simulator's description of the episode; "" without `reset`.
         """
         client = self.node.create_client(ChangeState, f"{AGENT}/change_state")
-        has_agent = client.wait_for_service(SETTLED)
+        has_agent = client.wait_for_service(SETTLING_TIME)
         self.node.destroy_client(client)
         # The reset moves the arm: an active agent would pull it back.
         active = has_agent and self._change(Transition.TRANSITION_DEACTIVATE)
@@ -135,7 +135,7 @@ class DemoOperator(Operator):
     def __init__(self, node: Any, topic: str, stopped: Event, agent: BaseProcess, simulator: BaseProcess) -> None:
         super().__init__(node, topic, (agent, simulator))
         self.stopped = stopped
-        node.create_subscription(String, f"{SIMULATOR}/episode", self._on_episode, LATCHED)
+        node.create_subscription(String, f"{SIMULATOR}/episode", self._on_episode, LATCHED_QOS)
         self._episode: SimulatedEpisode | None = None
         self.wait(lambda: self._words.get_subscription_count() >= 2, "both nodes to subscribe", START)
 
@@ -162,7 +162,7 @@ class DemoOperator(Operator):
 
     def _on_episode(self, message: Any) -> None:
         try:
-            self._episode = SimulatedEpisode.of(message)
+            self._episode = SimulatedEpisode.from_message(message)
         except UserError as error:  # anybody on the network can send one
             log.warning("dropped a message: %s", error)
 

@@ -15,7 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 from vla.deploy.commands import ArmOutput, GripperOutput
 from vla.deploy.control_loop import ControlLoop
 from vla.deploy.diagnostics import Diagnostics
-from vla.deploy.inference import Inference, executed
+from vla.deploy.inference import Inference, actions_per_plan
 from vla.deploy.inputs import Inputs
 from vla.deploy.lifecycle_node import GuardedLifecycleNode, transition
 from vla.deploy.safety import State
@@ -23,7 +23,7 @@ from vla.deploy.settings import PolicySettings
 from vla.io.errors import UserError
 from vla.policy import Policy
 
-DELIVERED = Duration(seconds=1.0)  # longest wait for the last commands to arrive
+DELIVERY_TIMEOUT = Duration(seconds=1.0)  # longest wait for the last commands to arrive
 
 
 class PolicyNode(GuardedLifecycleNode):
@@ -48,7 +48,7 @@ class PolicyNode(GuardedLifecycleNode):
         if missing_cameras := sorted(set(spec.cameras) - set(topics.images)):
             names = ", ".join(missing_cameras)
             raise UserError(f"no topic for cameras {names}: add +deploy.topics.images.{missing_cameras[0]}=TOPIC")
-        execute = executed(self.policy) if getattr(self.policy, "chunking", None) else None
+        execute = actions_per_plan(self.policy) if getattr(self.policy, "chunking", None) else None
         follows = not settings.dry_run
         loop = ControlLoop(spec, settings.robot, settings.safety, settings.command_hz, follows, execute)
         if settings.gripper is not None and not (loop.goals.has_gripper and topics.gripper):
@@ -136,7 +136,8 @@ class PolicyNode(GuardedLifecycleNode):
             if loop.motion.limiter.resting:
                 break
             time.sleep(loop.tick)
-        self._arm.publisher.wait_for_all_acked(DELIVERED)  # the last ones must arrive, even if the node then ends
+        # The last ones must arrive, even if the node then ends.
+        self._arm.publisher.wait_for_all_acked(DELIVERY_TIMEOUT)
         time.sleep(2 * loop.tick if self._senders else 0.0)  # a server is a little behind
         for sender in self._senders:
             sender.cancel()
@@ -197,7 +198,7 @@ class PolicyNode(GuardedLifecycleNode):
         try:
             if (result := inference.take()) is not None:
                 plan, seconds = result
-                follows, delay = loop.set_plan(plan), time.monotonic() - loop.observed_at
+                follows, delay = loop.set_plan(plan), time.monotonic() - loop.observation_time
                 if follows:
                     loop.delays.add(delay)
                 self.diagnostics.record("inference", seconds)

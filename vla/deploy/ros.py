@@ -18,8 +18,8 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge, Le
 
 from vla.io.errors import UserError
-from vla.io.printable import printable
-from vla.parallel.processes import stopped_by
+from vla.io.printable import escape
+from vla.parallel.processes import signal_event
 
 MAX_DOMAIN = 232  # larger domains have no UDP ports
 LOOPBACK = Path(__file__).with_name("loopback.xml")
@@ -92,7 +92,7 @@ def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
             f"this version of Python ({error})"
         ) from error
     hangup = () if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (signal.SIGHUP,)  # ignored by nohup
-    with stopped_by(signal.SIGINT, signal.SIGTERM, *hangup) as stop_event:
+    with signal_event(signal.SIGINT, signal.SIGTERM, *hangup) as stop_event:
         try:
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         except RuntimeError as error:
@@ -110,7 +110,7 @@ def plain_errors() -> Iterator[None]:
     try:
         yield
     except UserError as error:
-        sys.exit(printable(f"error: {error}"))
+        sys.exit(escape(f"error: {error}"))
     except OSError as error:
         sys.exit(f"error: {error.filename}: {error.strerror}" if error.filename else f"error: {error}")
 

@@ -11,7 +11,7 @@ from enum import StrEnum
 import numpy as np
 
 from vla.deploy.motion import Motion
-from vla.deploy.observer import Measured
+from vla.deploy.observer import JointMeasurement
 from vla.io.types import Count, Point, Positive
 
 
@@ -51,11 +51,11 @@ class Tracking:
         self._away_since: float | None = None
         self._lost = False  # True if the newest joint state was too old at the last check
 
-    def check(self, motion: Motion, newest: Measured, now: float) -> tuple[bool, bool]:
+    def check(self, motion: Motion, joint_state: JointMeasurement, now: float) -> tuple[bool, bool]:
         """Return whether the arm is off its commands for too long, and whether it moved while no joint state came."""
-        error = float(np.abs(motion.limiter.position - newest.joints).max())
+        error = float(np.abs(motion.limiter.position - joint_state.joints).max())
         deviates = motion.started and self._follows_positions and error > self._safety.tracking
-        was_lost, self._lost = self._lost, now - newest.at > self._safety.joints_age
+        was_lost, self._lost = self._lost, now - joint_state.stamp > self._safety.joints_age
         if self._lost or not deviates:
             self._away_since = None
         elif self._away_since is None:

@@ -8,7 +8,7 @@ import sys
 
 from vla.deploy.ros import NETWORKS, command_node
 from vla.deploy.settings import NAME
-from vla.io.printable import printable
+from vla.io.printable import escape
 from vla.spec import LONGEST_INSTRUCTION
 
 FLAGS = {  # in the order in which they are obeyed; the instruction follows --hand-over
@@ -44,7 +44,7 @@ def main() -> None:
 
         operator = Operator(node, options.topic)
         if options.reset:
-            print(printable(operator.next_episode()))
+            print(escape(operator.next_episode()))
         if options.hand_over:
             operator.hand_over(to_person=True)
         if options.instruction is not None:
@@ -54,7 +54,7 @@ def main() -> None:
         if options.resume:
             operator.resume()
         if options.state:
-            print(printable(operator.describe()))
+            print(escape(operator.describe()))
 
 
 if __name__ == "__main__":

@@ -36,13 +36,13 @@ from vla.deploy.client_observation import Keys, instruction
 from vla.io.array_messages import pack, unpack
 from vla.io.errors import UserError, counted
 from vla.io.types import Count, Text
-from vla.parallel.processes import stopped_by
+from vla.parallel.processes import signal_event
 from vla.spec import Array, Environment, Observation
 
 if TYPE_CHECKING:
     from vla.policy import Policy
 
-FULL = "no room beside {}: raise deploy.connections, or lower their cluster.workers\n"
+FULL_MESSAGE = "no room beside {}: raise deploy.connections, or lower their cluster.workers\n"
 PATIENCE = 3.0  # longest opening or closing of a connection by a client [s]
 WARNINGS = 20  # most warnings about clients in a minute
 INVALID, TOO_BIG, INTERNAL = 1007, 1009, 1011  # WebSocket close codes: invalid data, too large, error in the server
@@ -93,7 +93,7 @@ class PolicyServer:
                 f"deploy=server serves a trained policy, checkpoint=RUN; a {type(policy).__name__} cannot be served"
             )
         try:
-            with stopped_by(signal.SIGINT, signal.SIGTERM) as stop, Service(self, policy).in_thread() as url:
+            with signal_event(signal.SIGINT, signal.SIGTERM) as stop, Service(self, policy).serve_in_thread() as url:
                 log.info("serving the policy at %s", url)
                 stop.wait()
         except OSError as error:
@@ -111,7 +111,7 @@ class Service:
         self._warning_times = deque([-math.inf] * WARNINGS, WARNINGS)  # times of the last warnings [s]
 
     @contextmanager
-    def in_thread(self) -> Iterator[str]:
+    def serve_in_thread(self) -> Iterator[str]:
         """Serve in a thread of its own within the context; yield the URL."""
         with asyncio.Runner() as runner, ThreadPoolExecutor(1, "server") as thread:
             loop, url, stop = runner.get_loop(), queue.Queue[str](), asyncio.Event()
@@ -157,7 +157,9 @@ class Service:
         ):
             return connection.respond(HTTPStatus.UNAUTHORIZED, "send the API key as Authorization: Api-Key …\n")
         if len(self._lanes) >= self._settings.connections:
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, FULL.format(counted(len(self._lanes), "client")))
+            return connection.respond(
+                HTTPStatus.SERVICE_UNAVAILABLE, FULL_MESSAGE.format(counted(len(self._lanes), "client"))
+            )
         return None
 
     async def _talk(self, connection: ServerConnection) -> None:

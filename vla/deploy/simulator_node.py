@@ -16,7 +16,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from vla.deploy import messages
-from vla.deploy.lifecycle_node import LATCHED
+from vla.deploy.lifecycle_node import LATCHED_QOS
 from vla.deploy.messages import SimulatedEpisode
 from vla.deploy.settings import SimulatorSettings
 from vla.io.errors import UserError
@@ -58,7 +58,7 @@ class SimulatorNode(Node):
             camera: self.create_publisher(Image, topics.images[camera], qos) for camera in environment.spec.cameras
         }
         self._joints = self.create_publisher(JointState, topics.joint_states, qos)
-        self._episode = self.create_publisher(String, "~/episode", LATCHED)
+        self._episode = self.create_publisher(String, "~/episode", LATCHED_QOS)
         self.create_subscription(JointState, topics.commands, self._on_command, qos)
         self.create_subscription(String, topics.instruction, self._on_instruction, qos)
         self.create_service(Trigger, "~/reset", self._on_reset)

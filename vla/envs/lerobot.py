@@ -87,7 +87,7 @@ def observations(batch: Mapping[str, Any], spec: Spec) -> list[Observation]:
         UserError: an entry is missing or has another shape.
     """
     parts = _parts(spec)
-    image_names = spec.given([PICTURE] if IMAGE in batch else [])
+    image_names = spec.required_images([PICTURE] if IMAGE in batch else [])
     sole_image = image_names if IMAGE in batch and len(image_names) == 1 else []  # the only image of batch and policy
     keys = {name: IMAGE if name in (PICTURE, *sole_image) else f"{IMAGES}{name}" for name in image_names}
     entries = [*keys.values(), *parts, TASK]

@@ -33,14 +33,14 @@ LENIENT = ConfigDict(STRICT, extra="ignore")
 SHA256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 
 
-def read_json(path: Path, kind: type[T], largest: int = MAX_BYTES) -> T:
+def read_json(path: Path, kind: type[T], max_bytes: int = MAX_BYTES) -> T:
     """Read the JSON file at `path` as a `kind`: a dataclass, a typed dictionary or any annotation.
 
     Raises:
-        UserError: the file is larger than `largest` [bytes], nested too deep, not JSON, or not of that kind.
+        UserError: the file is larger than `max_bytes` [bytes], nested too deep, not JSON, or not of that kind.
         OSError: it cannot be read.
     """
-    return parse_json(read_bounded(path, largest), kind, str(path))
+    return parse_json(read_bounded(path, max_bytes), kind, str(path))
 
 
 def read_yaml(path: Path, kind: type[T]) -> T:
@@ -87,7 +87,7 @@ def _require_shallow(text: bytes) -> None:
             raise ValueError(f"nested deeper than {MAX_DEPTH} levels, or with aliases or numbers of 100 digits")
 
 
-def resolved(value: Any, name: str) -> Any:
+def resolve_config(value: Any, name: str) -> Any:
     """Return a copy of a configuration from a file, called `name`: dicts with texts as keys, lists, and plain values.
 
     Raises:
@@ -118,8 +118,8 @@ def resolved(value: Any, name: str) -> Any:
 
 
 def read_resolved(path: Path) -> Any:
-    """Read the JSON file at `path` as a configuration, see `read_json` and `resolved`."""
-    return resolved(read_json(path, Any, MAX_RESOLVED_BYTES), str(path))
+    """Read the JSON file at `path` as a configuration, see `read_json` and `resolve_config`."""
+    return resolve_config(read_json(path, Any, MAX_RESOLVED_BYTES), str(path))
 
 
 def mappings(value: Any) -> Iterator[dict[Any, Any]]:
@@ -130,12 +130,12 @@ def mappings(value: Any) -> Iterator[dict[Any, Any]]:
         yield from mappings(part)
 
 
-def canonical(value: Any) -> Any:
+def canonicalize(value: Any) -> Any:
     """Return a plain value without keys whose value is null, at every level, and with integral floats as integers."""
     if isinstance(value, dict):
-        return {name: canonical(item) for name, item in value.items() if item is not None}
+        return {name: canonicalize(item) for name, item in value.items() if item is not None}
     if isinstance(value, list):
-        return [canonical(item) for item in value]
+        return [canonicalize(item) for item in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
@@ -151,12 +151,12 @@ def _prefix(location: tuple[int | str, ...]) -> str:
     return f"{path.lstrip('.')[:100]}: " if path else ""
 
 
-def read_bounded(path: Path, largest: int = MAX_BYTES) -> bytes:
-    """Read a file of at most `largest` bytes, see `read_json`."""
+def read_bounded(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
+    """Read a file of at most `max_bytes` bytes, see `read_json`."""
     require_file(path)
     size = path.stat().st_size
-    if size > largest:
-        raise UserError(f"{path} has {size} bytes, more than the {largest} that such a file can have")
+    if size > max_bytes:
+        raise UserError(f"{path} has {size} bytes, more than the {max_bytes} that such a file can have")
     return path.read_bytes()
 
 

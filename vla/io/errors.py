@@ -18,7 +18,7 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 'es' if noun.endswith(('s', 'ch')) else 's'}"
 
 
-def suggestion(name: str, known: Iterable[str]) -> str:
+def suggestion(name: str, names: Iterable[str]) -> str:
     """Return `, did you mean …?`, or an empty string without a similar name."""
-    matches = get_close_matches(name, list(known), n=1)
+    matches = get_close_matches(name, list(names), n=1)
     return f", did you mean {matches[0]}?" if matches else ""

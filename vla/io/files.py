@@ -102,15 +102,15 @@ def writing(target: Path) -> Iterator[None]:
         ) from error
 
 
-def locked(path: Path, busy: str) -> FileLock:
-    """Acquire a lock without waiting; a UserError with the text `busy` if another process holds it."""
+def try_lock(path: Path, message: str) -> FileLock:
+    """Acquire a lock without waiting; a UserError with the text `message` if another process holds it."""
     from filelock import FileLock, Timeout  # takes 30 ms, and most processes lock nothing
 
     lock = FileLock(path, blocking=False)
     try:
         lock.acquire()
     except Timeout as error:
-        raise UserError(busy) from error
+        raise UserError(message) from error
     return lock
 
 

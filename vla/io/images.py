@@ -25,7 +25,7 @@ MOST_PIXELS = 4096 * 4096  # of a file, whose header may promise any number
 Fit = Literal["crop", "pad", "stretch"]  # for another aspect ratio: the centre, black borders, or distorted
 
 
-def fitted(images: Tensor, size: tuple[int, int], fit: Fit) -> Tensor:
+def fit_images(images: Tensor, size: tuple[int, int], fit: Fit) -> Tensor:
     """Resize (N, …, H, W, 3) uint8 images to `size` (height, width), bilinear and antialiased, on their device.
 
     Images of that size are returned as they are.
@@ -60,7 +60,7 @@ def resize(image: Array, size: tuple[int, int]) -> Array:
         return image
     import torch
 
-    return fitted(torch.tensor(image)[None], size, "crop")[0].numpy()
+    return fit_images(torch.tensor(image)[None], size, "crop")[0].numpy()
 
 
 def decode_image(content: bytes, size: tuple[int, int] | None = None) -> Array:

@@ -18,7 +18,7 @@ from vla.io.types import names_a_file
 Array = np.ndarray
 
 PICTURE = "picture"  # in place of a camera: the whole picture
-WHOLE = (0.0, 0.0, 1.0, 1.0)  # window of all of it: top, left, bottom, right
+FULL_WINDOW = (0.0, 0.0, 1.0, 1.0)  # window of all of it: top, left, bottom, right
 
 Name = Annotated[str, MinLen(1), MaxLen(100)]
 Camera = Annotated[Name, Predicate(names_a_file)]
@@ -34,14 +34,14 @@ class Part:
     __pydantic_config__ = STRICT
 
     camera: Camera
-    window: Annotated[tuple[float, ...], MinLen(4), MaxLen(4)] = WHOLE  # of a moving part: relative to its centre
+    window: Annotated[tuple[float, ...], MinLen(4), MaxLen(4)] = FULL_WINDOW  # of a moving part: relative to its centre
     point: Annotated[tuple[Name, ...], MaxLen(3)] = ()  # (3,) state components of a position [m]; empty: it is fixed
     offset: Annotated[tuple[float, ...], MaxLen(3)] = ()  # (3,) from that position to the centre of the part [m]
     # (12,) rows of a matrix: the centre's (x, y, z, 1) → depth times (down, across, 1), as shares of the picture.
     projection: Annotated[tuple[float, ...], MaxLen(12)] = ()
     pixels: Annotated[int, Ge(1), Le(4096)] = 1  # a moving part moves in steps of 1 / pixels of the picture
 
-    def at(self, place: Array) -> Array:
+    def window_at(self, place: Array) -> Array:
         """Return the window (4,), within the picture, with the point at `place` (3,) [m]."""
         window = np.array(self.window)
         if not self.point:
@@ -52,7 +52,7 @@ class Part:
         corner = (np.rint(self.pixels * corner) / self.pixels).clip(0, 1 - size)
         return np.concatenate([corner, corner + size])
 
-    def whole(self, size: tuple[int, int]) -> tuple[int, int]:
+    def picture_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return height and width [px] of the smallest picture in which the part has at least `size` pixels."""
         top, left, bottom, right = self.window
         return max(self.pixels, ceil(size[0] / (bottom - top))), max(self.pixels, ceil(size[1] / (right - left)))
@@ -102,6 +102,7 @@ def with_parts(
     return {
         **images,
         **{
-            part.camera: cut(images[PICTURE], part.at(place), size) for part, place in zip(missing, places, strict=True)
+            part.camera: cut(images[PICTURE], part.window_at(place), size)
+            for part, place in zip(missing, places, strict=True)
         },
     }

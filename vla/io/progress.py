@@ -11,7 +11,7 @@ from rich.table import Column
 
 log = logging.getLogger(__name__)
 
-EVERY = 60.0  # between two lines [s]
+LOG_INTERVAL = 60.0  # between two lines [s]
 
 
 class Bar(Progress):
@@ -33,7 +33,7 @@ class Bar(Progress):
         """Show that `done` items are completed, with a note."""
         (task,) = self.tasks
         self.update(task.id, completed=done, description=note)
-        if time.monotonic() - self._logged_at >= EVERY and not self.console.is_terminal:
+        if time.monotonic() - self._logged_at >= LOG_INTERVAL and not self.console.is_terminal:
             self._logged_at, seconds_left = time.monotonic(), task.time_remaining
             total = "" if task.total is None else f" of {task.total:.0f}"
             time_left = "" if seconds_left is None else f"{timedelta(seconds=round(seconds_left))} left"

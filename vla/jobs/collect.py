@@ -34,9 +34,9 @@ def demonstrations(experiment: Experiment) -> EpisodeStore:
         store = _fill(experiment)
     else:
         folder = experiment["expert"].get("folder")
-        if folder and Path(folder).exists() and not store.derived and (recordings := _source(experiment)[2]):
+        if folder and Path(folder).exists() and not store.is_derived and (recordings := _source(experiment)[2]):
             recordings.require_held(store)
-        if store.derived:
+        if store.is_derived:
             store.spec.require_input(experiment.world().spec, f"the episode store {store.folder}", "the task")
         if keys := [key for key, node in experiment.source.items() if store.lacks(key, node)]:
             log.warning("%s was derived from demonstrations with another %s", store.folder, " and another ".join(keys))

@@ -6,14 +6,14 @@ import logging
 from functools import partial
 from typing import Any
 
-from vla.config.differences import at
+from vla.config.differences import value_at
 from vla.config.experiment import Experiment
 from vla.io.errors import UserError
-from vla.io.printable import printable
+from vla.io.printable import escape
 from vla.models.policy_folder import require_unseen
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.run_page import write_page
-from vla.runs.folder import PLOT, REPORT, described
+from vla.runs.folder import PLOT, REPORT, describe_files
 from vla.spec import FIRST_SEED
 
 log = logging.getLogger(__name__)
@@ -25,7 +25,7 @@ def run(experiment: Experiment) -> None:
     Raises a UserError if the policy may have been trained or selected on an episode of the deployment, or if an episode
     ended in an error.
     """
-    seed, episodes = (at(experiment["deploy"], key, None) for key in ("simulator.seed", "episodes"))
+    seed, episodes = (value_at(experiment["deploy"], key, None) for key in ("simulator.seed", "episodes"))
     if seed is not None and episodes is not None:  # whose success is reported
         if seed < FIRST_SEED:
             raise UserError(f"deploy.simulator.seed={seed}: seeds below {FIRST_SEED} are for demonstrations: raise it")
@@ -39,8 +39,8 @@ def run(experiment: Experiment) -> None:
         output = experiment.output
         write_report(report, output / REPORT, experiment.settings.checkpoint, experiment.config)
         plot_report(report, output / PLOT)
-        log.info("wrote %s", described([write_page(output), output / REPORT, output / PLOT]))
-        print(printable(str(report)))
+        log.info("wrote %s", describe_files([write_page(output), output / REPORT, output / PLOT]))
+        print(escape(str(report)))
         if report.errors:
             raise UserError(f"the last episode ended with an error, see {output / REPORT}: {report.errors[0].error}")
 

@@ -16,13 +16,13 @@ from typing import Any
 
 from vla.config.annotations import locate
 from vla.config.build import Group, build
-from vla.config.differences import NOT_COMPARED
+from vla.config.differences import IGNORED_KEYS
 from vla.config.experiment import Experiment
 from vla.config.nodes import NEAREST, Evaluation, with_changes
 from vla.data.index import INDEX
 from vla.io.errors import UserError, counted
 from vla.io.files import warn_on_error, writing
-from vla.io.printable import printable, show
+from vla.io.printable import escape, show
 from vla.io.versions import installed_versions
 from vla.models.chunking import require_fit
 from vla.models.policy_folder import read_policy, require_unseen
@@ -32,13 +32,13 @@ from vla.reports.result_tables import conditions_table, plot_conditions, seconda
 from vla.reports.run_page import write_page
 from vla.rollouts.comparison import compare_conditions
 from vla.rollouts.evaluate import evaluate
-from vla.rollouts.memorisation import make_nearest, make_without, open_memory
-from vla.rollouts.realtime import make_over_network
-from vla.rollouts.recordings import clear, keep_pictures, merge_recordings
+from vla.rollouts.memorisation import make_agent_without, make_nearest, open_memory
+from vla.rollouts.realtime import make_networked
+from vla.rollouts.recordings import clear_recordings, keep_pictures, merge_recordings
 from vla.rollouts.results import Report
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory
 from vla.rollouts.shared_policy import shared_policy
-from vla.rollouts.statements import AgainstBar, AgainstRun, Statement, differs_clearly
+from vla.rollouts.statements import BarStatement, RunStatement, Statement, differs_clearly
 from vla.runs.folder import (
     CHECKPOINTS,
     PAGE,
@@ -47,11 +47,11 @@ from vla.runs.folder import (
     RECORDINGS,
     REPORT,
     SUITE,
-    described,
+    describe_files,
     require_run,
     save_config,
 )
-from vla.runs.played import Played
+from vla.runs.played import PlayedEpisodes
 from vla.runs.resume import cached_success
 from vla.schedule import Delays
 from vla.spec import IN_DISTRIBUTION, Multitask
@@ -72,7 +72,7 @@ def run(experiment: Experiment) -> float | None:
     if checkpoint is agent is None:
         return None
     if experiment.playable:
-        return evaluated(experiment, checkpoint)
+        return evaluate_checkpoint(experiment, checkpoint)
     from vla.jobs.open_loop import evaluate_open_loop  # imports Lightning, which takes seconds, as training does
 
     return evaluate_open_loop(experiment, checkpoint)
@@ -89,7 +89,7 @@ def _train(experiment: Experiment) -> Path | None:
     return None
 
 
-def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
+def evaluate_checkpoint(experiment: Experiment, checkpoint: Path | None) -> float:
     """Return the success rate of a policy, or of the agent of the config.
 
     A finished evaluation of a policy is not repeated, and an unfinished one continues after the episodes that were
@@ -104,7 +104,7 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
     statements, conclusions = _statements(experiment), list[str]()
     _ = experiment.origin  # determine it now, before the code may change
     try:
-        with Played(output, identity) as played:
+        with PlayedEpisodes(output, identity) as played:
             with agents_for_workers(experiment, checkpoint) as make_agent:
                 reports = _play(experiment, make_agent, statements, played)
             if checkpoint and read_policy(checkpoint).training.weights != weights:  # workers read them as they start
@@ -120,13 +120,13 @@ def evaluated(experiment: Experiment, checkpoint: Path | None) -> float:
                 raise UserError(f"{counted(errors, 'episode')} ended in an error, see {output / REPORT}: {hint}")
     finally:
         for line in conclusions:  # after whatever was logged, because scripts read the last line
-            print(printable(line))
+            print(escape(line))
     return report.success
 
 
 def _identity(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]:
     """Return what determines the results of an evaluation."""
-    config = {name: node for name, node in experiment.config.items() if name not in NOT_COMPARED}
+    config = {name: node for name, node in experiment.config.items() if name not in IGNORED_KEYS}
     weights = read_policy(checkpoint).training.weights if checkpoint else None
     nearest = experiment.evaluate.nearest
     replayed = hashlib.sha256((Path(nearest) / INDEX).read_bytes()).hexdigest() if nearest else None
@@ -161,16 +161,16 @@ def _conditions(experiment: Experiment, make_agent: AgentFactory) -> dict[str, t
         if with_changes(experiment["task"], changes) != experiment["task"]:
             conditions[name] = experiment.make_environment(changes), make_agent
     for modality in options.without:
-        conditions[f"without_{modality}"] = world, partial(make_without, make_agent, modality)
+        conditions[f"without_{modality}"] = world, partial(make_agent_without, make_agent, modality)
     if options.nearest:
         conditions[NEAREST] = world, partial(make_nearest, Path(options.nearest).resolve())
     for name, node in options.networks.items():
-        conditions[name] = world, partial(make_over_network, make_agent, build(node, NETWORK))
+        conditions[name] = world, partial(make_networked, make_agent, build(node, NETWORK))
     return conditions
 
 
 def _play(
-    experiment: Experiment, make_agent: AgentFactory, statements: Sequence[Statement], played: Played
+    experiment: Experiment, make_agent: AgentFactory, statements: Sequence[Statement], played: PlayedEpisodes
 ) -> dict[str, Report]:
     """Return condition → report on the same seeds; only the first, the training condition, is recorded.
 
@@ -182,7 +182,7 @@ def _play(
     if make_recorder:
         recordings.mkdir(exist_ok=True)
     if not any(played.results.values()):
-        clear(recordings)
+        clear_recordings(recordings)
     world = experiment.world() if options.until else None
     turns = len(world.tasks) if isinstance(world, Multitask) else 1
     lanes = 1 if _is_shared(experiment) else (experiment["policy"] or {}).get("lanes", 1)  # shared: workers are lanes
@@ -196,8 +196,8 @@ def _play(
             *(make_environment, make_its_agent, make_recorder if is_first else None, seeds),
             name=f"{label} ({number} of {len(conditions)})" if len(conditions) > 1 else label,
             until=until if options.until else None,
-            known=played.results[name],
-            keep=partial(played.add, name),
+            known_results=played.results[name],
+            on_result=partial(played.add, name),
         )
         if is_first:
             seeds = [result.seed for result in reports[name].results]
@@ -225,7 +225,7 @@ def require_possible(experiment: Experiment) -> None:
             method = locate("policy.chunking._target_", chunking["_target_"])
             delays = Delays(1 / experiment.world().spec.control_hz)
             delays.add(network.latency + network.jitter)
-            require_fit(method, experiment["model"], delays.longest)
+            require_fit(method, experiment["model"], delays.forecast)
     if not experiment.playable and options.conditions:
         raise UserError("evaluate.conditions change a world, and a recording has none: omit them")
     if options.nearest is not None:
@@ -262,15 +262,15 @@ def _statements(experiment: Experiment) -> list[Statement]:
     """Build the statements to decide; raise a UserError if the run to compare with is missing, or nothing to decide."""
     options, statements = experiment.evaluate, list[Statement]()
     if options.bar is not None:
-        statements.append(AgainstBar(options.bar))
+        statements.append(BarStatement(options.bar))
     if options.against is not None:
         statements.append(_against_run(experiment, options.against))
-    if options.until and not (statements or options.changes or options.of_agents):
+    if options.until and not (statements or options.changes or options.agent_conditions):
         raise UserError(
             "evaluate.until=decided needs something to decide: evaluate.bar=0.95, evaluate.against=RUN, or conditions, "
             "as in evaluate=suite"
         )
-    if not experiment.playable and (statements or options.until or options.of_agents):
+    if not experiment.playable and (statements or options.until or options.agent_conditions):
         raise UserError(
             "evaluate.bar, against, until, without, nearest and networks need a success rate, which recordings lack: "
             "omit them"
@@ -278,7 +278,7 @@ def _statements(experiment: Experiment) -> list[Statement]:
     return statements
 
 
-def _against_run(experiment: Experiment, run: str) -> AgainstRun:
+def _against_run(experiment: Experiment, run: str) -> RunStatement:
     """Build the comparison with another run; raise a UserError if it has no report or no episode in common."""
     report = require_run(Path(run)).report
     if report is None:
@@ -286,7 +286,7 @@ def _against_run(experiment: Experiment, run: str) -> AgainstRun:
     results = {result.seed: result for result in report.per_episode}
     if not any(result.draws for result in report.per_episode) and report.config.get("task") != experiment["task"]:
         results = {}  # without draws to compare, equal seeds are the same episodes in the same task only
-    statement = AgainstRun(run, results, experiment.evaluate.margin, report.anytime)
+    statement = RunStatement(run, results, experiment.evaluate.margin, report.anytime)
     statement.require_common(experiment.evaluate.seeds)
     return statement
 
@@ -322,7 +322,7 @@ def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, R
     page = None
     with warn_on_error(output / PAGE):
         page = write_page(output)
-    log.info("wrote %s", described([page, output / REPORT, output / PLOT, recording]))
+    log.info("wrote %s", describe_files([page, output / REPORT, output / PLOT, recording]))
 
 
 def _errors(reports: Mapping[str, Report]) -> int:

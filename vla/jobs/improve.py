@@ -14,17 +14,17 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 
-from vla.config.adopt import LAST, require_identity
+from vla.config.adopt import LAST_CHECKPOINT, require_identity
 from vla.config.check import devices
-from vla.config.differences import at
+from vla.config.differences import value_at
 from vla.config.experiment import Experiment
 from vla.config.nodes import Rounds, with_changes
 from vla.data.episodes import EpisodeStore
 from vla.data.header import is_store
-from vla.data.index import listed
+from vla.data.index import format_numbers
 from vla.io.errors import UserError, counted
 from vla.jobs.collect import complete_store, demonstrations
-from vla.jobs.evaluate import agents_for_workers, evaluated, require_possible
+from vla.jobs.evaluate import agents_for_workers, evaluate_checkpoint, require_possible
 from vla.jobs.train import train
 from vla.models.policy_folder import read_policy
 from vla.rollouts.collect import collect
@@ -55,7 +55,7 @@ def run(experiment: Experiment) -> float:
 def _improve(experiment: Experiment, seeds: range) -> float:
     options, output = experiment.options(Rounds), experiment.output
     checkpoint, stores = experiment.pretrained, list[Path]()
-    if (report := read_report(output)) and (count := at(report.config, "improve.rounds", 0)) < options.rounds:
+    if (report := read_report(output)) and (count := value_at(report.config, "improve.rounds", 0)) < options.rounds:
         archive_evaluation(output, count)
     if checkpoint is None:
         checkpoint = _train(experiment.with_values({"job": "train", "output": str(output / "round_0")}))
@@ -66,7 +66,7 @@ def _improve(experiment: Experiment, seeds: range) -> float:
         successes = sum(entry.success for entry in store.episodes)
         log.info("round %d: success in %d of %s", number, successes, counted(len(store.episodes), "labelled episode"))
         checkpoint = _train(_round(experiment, checkpoint, folder, stores))
-    return evaluated(experiment, checkpoint)
+    return evaluate_checkpoint(experiment, checkpoint)
 
 
 def _save_config(experiment: Experiment) -> None:
@@ -89,7 +89,7 @@ def _require_possible(experiment: Experiment) -> range:
     seeds = options.seeds
     if seeds.stop > FIRST_SEED:
         raise UserError(f"improve.seed={seeds.start}: its rounds reach {FIRST_SEED}, where evaluation begins: lower it")
-    if (Path(experiment.settings.output) / LAST).exists():
+    if (Path(experiment.settings.output) / LAST_CHECKPOINT).exists():
         raise UserError(f"{experiment.settings.output} has a training without rounds: choose another output=DIR")
     if devices(experiment["trainer"]) > 1:
         raise UserError("job=improve trains on one device, as its trainings follow each other: add trainer.devices=1")
@@ -110,7 +110,7 @@ def _require_possible(experiment: Experiment) -> range:
 
 def _require_further_episodes(experiment: Experiment, policy: Path) -> None:
     """Raise a UserError if the policy was trained on further stores, such as rounds, and `collect.more` is not set."""
-    stores = at(read_policy(policy).config, "collect.more", None)
+    stores = value_at(read_policy(policy).config, "collect.more", None)
     if isinstance(stores, list) and stores and experiment.collect.more is None:
         names = ",".join(map(str, stores))
         raise UserError(
@@ -121,11 +121,11 @@ def _require_further_episodes(experiment: Experiment, policy: Path) -> None:
 
 def require_new(seeds: range, store: EpisodeStore) -> None:
     """Raise a UserError if a demonstration has one of the seeds."""
-    used_seeds = [entry.seed for entry in store.tried if entry.seed in seeds]
+    used_seeds = [entry.seed for entry in store.attempts if entry.seed in seeds]
     if used_seeds:
         raise UserError(
             f"improve.seed={seeds.start}: the {len(seeds)} seeds of the rounds must be new, and the demonstrations in "
-            f"{store.folder} have {listed(used_seeds)}: set improve.seed={max(used_seeds) + 1}, or higher"
+            f"{store.folder} have {format_numbers(used_seeds)}: set improve.seed={max(used_seeds) + 1}, or higher"
         )
 
 

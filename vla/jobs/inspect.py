@@ -11,7 +11,7 @@ from vla.config.experiment import Experiment, make_environment
 from vla.config.nodes import Inspection
 from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
-from vla.data.index import listed
+from vla.data.index import format_numbers
 from vla.data.verification import find_episode, require_whole, verify_store
 from vla.io.errors import UserError, counted
 from vla.io.files import warn_on_error
@@ -34,14 +34,14 @@ def run(experiment: Experiment) -> None:
         _replay_episode(experiment, Path(options.folder), options.episode)
 
 
-def inspect_store(wanted: Inspection) -> None:
+def inspect_store(inspection: Inspection) -> None:
     """Verify and describe a store, or a new one made by merging, filtering or repair.
 
     Raises a UserError if the store cannot be read or made, or, after its intact episodes are described, is damaged.
     """
-    findings = verify_store(EpisodeStore(_store_folder(wanted), damaged=True))
+    findings = verify_store(EpisodeStore(_store_folder(inspection), allow_damage=True))
     show(store_table(findings))
-    if findings.whole:
+    if findings.intact_entries:
         with warn_on_error(findings.store.folder / "card.md"):  # a store may be read-only
             log.info("wrote %s and card.png", write_card(findings))
     require_whole(findings)
@@ -55,15 +55,17 @@ def _store_folder(options: Inspection) -> Path:
             raise UserError("inspect.stores and inspect.where make a new store: give its folder, inspect.into=DIR")
         if not options.repair:
             return folder
-        if not verify_store(EpisodeStore(folder, damaged=True)).damaged:
+        if not verify_store(EpisodeStore(folder, allow_damage=True)).damaged_seeds:
             log.info("nothing in %s is damaged, so nothing is repaired", folder)
             return folder
-    sources = [EpisodeStore(source, damaged=options.repair) for source in options.stores or [folder]]
+    sources = [EpisodeStore(source, allow_damage=options.repair) for source in options.stores or [folder]]
     target = Path(options.into or f"{folder}-repaired")
     damaged = derive_store(sources, target, options.where, options.repair)
     log.info("wrote %s; its sources are unchanged", target)
     if damaged:
-        log.warning("counted as failed from now on: %s, %s", counted(len(damaged), "damaged seed"), listed(damaged))
+        log.warning(
+            "counted as failed from now on: %s, %s", counted(len(damaged), "damaged seed"), format_numbers(damaged)
+        )
     return target
 
 
@@ -74,7 +76,7 @@ def _replay_episode(experiment: Experiment, folder: Path, seed: int) -> None:
     replaces that of the store's task, which may not name files. Raises a UserError if there is no such episode, its
     store lacks the task, or the task now has another spec.
     """
-    store, output, robot = EpisodeStore(folder, damaged=True), experiment.output, experiment["task"].get("robot")
+    store, output, robot = EpisodeStore(folder, allow_damage=True), experiment.output, experiment["task"].get("robot")
     config, episode = find_episode(store, seed)
     if not isinstance(config.get("task"), dict):
         raise UserError(f"{folder} does not contain the task of seed {seed}, so there is no scene to replay it in")
@@ -89,7 +91,7 @@ def _replay_episode(experiment: Experiment, folder: Path, seed: int) -> None:
 
         recorder, file_name = RerunRecorder(output, pictures=0), f"{recording_name(seed, episode.outcome)}.rrd"
     with environment.blind():
-        step = replay(environment, episode, recorder).differs
+        step = replay(environment, episode, recorder).first_difference
     environment.close()
     if step is None:
         log.info("the replay goes through the same states, bit for bit, and ends in %s", episode.outcome)

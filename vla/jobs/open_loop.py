@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from vla.config.differences import at
+from vla.config.differences import value_at
 from vla.config.experiment import Experiment
-from vla.data.datamodule import digest_of, held_out
+from vla.data.datamodule import digest_of, is_held_out
 from vla.data.episodes import EpisodeStore
 from vla.data.header import is_store
 from vla.data.index import Entry, recording_of
@@ -27,7 +27,7 @@ from vla.reports.open_loop import components, errors_table, plot_errors, write_e
 from vla.reports.run_page import write_page
 from vla.rollouts.open_loop import OpenLoop, open_loop
 from vla.rollouts.rollout import close_agent
-from vla.runs.folder import ERRORS, ERRORS_PLOT, PAGE, described, save_config
+from vla.runs.folder import ERRORS, ERRORS_PLOT, PAGE, describe_files, save_config
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     with warn_on_error(output / PAGE):
         page = write_page(output)
     show(errors_table(components(result), len(result.seeds)))
-    files = described([page, output / ERRORS, output / ERRORS_PLOT])
+    files = describe_files([page, output / ERRORS, output / ERRORS_PLOT])
     log.info("wrote %s: open-loop errors, which are not a success rate", files)
     return -result.relative
 
@@ -80,13 +80,13 @@ def _held_out_fraction(experiment: Experiment, checkpoint: Path | None) -> float
         world = experiment.world().spec
         policy.spec.require_input(world, f"the checkpoint {checkpoint}", "the task, with the options given here,")
         # Else `_require_trained_on` would find other images, after an import.
-        size, value = (at(config, "task.image_size") for config in (policy.config, experiment.config))
+        size, value = (value_at(config, "task.image_size") for config in (policy.config, experiment.config))
         if size != value:
             raise UserError(
                 f"{checkpoint} was trained with task.image_size={str(size)[:50]}, not {value}, and only images of that "
                 "size tell which episodes were held out: set it as in training"
             )
-        fraction = at(policy.config, "data.validation_fraction", None)
+        fraction = value_at(policy.config, "data.validation_fraction", None)
     if not isinstance(fraction, float | int) or not fraction:
         raise UserError(
             f"data.validation_fraction={fraction}: {subject} on all episodes, and errors on these say nothing about "
@@ -115,7 +115,7 @@ def _measure(experiment: Experiment, store: EpisodeStore, fraction: float, polic
     """Return the errors on the held-out episodes; raise a UserError if there are none, or no others."""
     parts: dict[bool, list[Entry]] = {True: [], False: []}
     for entry in store.episodes:
-        parts[held_out(recording_of(entry), fraction)].append(entry)
+        parts[is_held_out(recording_of(entry), fraction)].append(entry)
     if not all(parts.values()):
         raise UserError(
             f"data.validation_fraction={fraction} holds {len(parts[True])} of the {len(store.episodes)} episodes in "

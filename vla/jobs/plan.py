@@ -12,7 +12,7 @@ from vla.io.printable import show
 from vla.reports.comparison import common_episodes, read_runs
 from vla.reports.tables import Table
 from vla.rollouts.planning import (
-    MOST,
+    MAX_EPISODES,
     Stopping,
     episodes_needed,
     power_for_bar,
@@ -33,21 +33,21 @@ def run(experiment: Experiment) -> None:
     show(plan_table(experiment.options(Power)))
 
 
-def plan_table(asked: Power) -> Table:
+def plan_table(power: Power) -> Table:
     """Tabulate numbers of episodes, for each policy if there are two; raise a UserError if the rates are equal."""
-    one, other = asked.rates
+    one, other = power.rates
     if one == other:
-        raise UserError(f"plan.rates={asked.rates} are equal: no number of episodes tells them apart")
-    fixed = episodes_needed(partial(power_for_bar, rate=other, bar=one), asked.power)
-    stops = stopping(one, other, 1 - other, asked.power, fixed) if fixed else None
+        raise UserError(f"plan.rates={power.rates} are equal: no number of episodes tells them apart")
+    fixed = episodes_needed(partial(power_for_bar, rate=other, bar=one), power.power)
+    stops = stopping(one, other, 1 - other, power.power, fixed) if fixed else None
     rows = [[f"one policy, {_percent(other)} against a bar of {_percent(one)}", *_numbers(fixed, stops)]]
-    fixed = episodes_needed(partial(power_of_samples, one=one, other=other), asked.power)
+    fixed = episodes_needed(partial(power_of_samples, one=one, other=other), power.power)
     rows.append(["two policies, different episodes", *_numbers(fixed, None)])
     difference = abs(other - one)
-    for case, share in _shares(asked, one, other).items():
-        fixed = episodes_needed(partial(power_of_pairs, discordant=share, difference=difference), asked.power)
+    for case, share in _shares(power, one, other).items():
+        fixed = episodes_needed(partial(power_of_pairs, discordant=share, difference=difference), power.power)
         ones, zeros = (share + difference) / 2, (share - difference) / 2
-        stops = stopping(0.5, ones, zeros, asked.power, fixed) if fixed else None
+        stops = stopping(0.5, ones, zeros, power.power, fixed) if fixed else None
         rows.append([f"two policies, same episodes, {_percent(share)} differ{case}", *_numbers(fixed, stops)])
     heads = ("compared", "episodes", "until=decided: at most", "on average", "false differences")
     return Table(heads, rows, note=NOTE)
@@ -85,8 +85,8 @@ def _measured_share(folders: tuple[str, str]) -> float:
 
 def _numbers(fixed: int | None, stops: Stopping | None) -> tuple[str, ...]:
     if stops is None:
-        return f"{fixed}" if fixed else f"more than {MOST}", "", "", ""
-    return str(fixed), str(stops.most), f"{stops.mean:.0f}", _percent(stops.wrong)
+        return f"{fixed}" if fixed else f"more than {MAX_EPISODES}", "", "", ""
+    return str(fixed), str(stops.max_episodes), f"{stops.mean:.0f}", _percent(stops.type_1_error)
 
 
 def _percent(share: float) -> str:

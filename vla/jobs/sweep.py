@@ -18,11 +18,13 @@ if TYPE_CHECKING:
     from vla.runs.sweep import SweepRow
 
 LOCK = ".lock"  # in the folder of a sweep
-EVERY = 10  # up to so many ended cells each one updates the table, then every tenth, because it reads all cells
+TABLE_INTERVAL = (
+    10  # up to so many ended cells each one updates the table, then every tenth, because it reads all cells
+)
 
 
 class SweepTable(Callback):
-    """Writes `sweep.html`, `sweep.md` and `sweep.png` after the first cells, then every `EVERY`, and at the end."""
+    """Writes `sweep.html`, `sweep.md` and `sweep.png` after the first cells, every `TABLE_INTERVAL`, and at the end."""
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Remove an earlier error of the cell."""
@@ -41,7 +43,7 @@ class SweepTable(Callback):
                 (Path(config.hydra.runtime.output_dir) / FAILURE).unlink(missing_ok=True)
             folder = Path(config.hydra.sweep.dir)
             count = len({*cells(folder, REPORT), *cells(folder, FAILURE)})
-            if count <= EVERY or count % EVERY == 0:
+            if count <= TABLE_INTERVAL or count % TABLE_INTERVAL == 0:
                 write_table(folder)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:

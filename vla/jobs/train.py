@@ -27,7 +27,7 @@ from vla.models.policy_folder import BEST, POLICY
 from vla.models.tokenizers.tokenizer import out_of_bounds, rounding
 from vla.models.trunk import is_within, trunks
 from vla.parallel.limits import cores
-from vla.reports.observations import SHOWN, draw_samples
+from vla.reports.observations import SHOWN_WINDOWS, draw_samples
 from vla.reports.run_page import write_page
 from vla.runs.files import Training
 from vla.runs.folder import (
@@ -170,14 +170,16 @@ def _windows(experiment: Experiment, store: EpisodeStore, model: Model, trainer:
                 "data.validation_fraction=0: no validation, so no episodes are played, and the last weights are used"
             )
     with warn_on_error(experiment.output / SAMPLES):
-        draw_samples(data.make_batch(data.order(0)[:SHOWN]), store.spec, experiment.output / SAMPLES)
+        draw_samples(data.make_batch(data.order(0)[:SHOWN_WINDOWS]), store.spec, experiment.output / SAMPLES)
     return data
 
 
 def _save(trainer: Trainer, output: Path) -> None:
     """Save the policy, or a better earlier one, then the checkpoint, whose `finished` says that the policy exists."""
     callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-    (folder,) = [callback.clearly_better() for callback in callbacks if isinstance(callback, ClosedLoop)] or [None]
+    (folder,) = [callback.clearly_better_policy() for callback in callbacks if isinstance(callback, ClosedLoop)] or [
+        None
+    ]
     if folder is None:
         trainer.save_checkpoint(output / POLICY, weights_only=False)
     elif trainer.is_global_zero:

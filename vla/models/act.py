@@ -94,7 +94,7 @@ class ACT(ContextModel):
 
         In training also mean and log_variance: (B, Z) each; with an auxiliary head truth: (B, 1, S), normalised.
         """
-        encoded = self.encoded(batch)
+        encoded = self.encode_context(batch)
         context, padding = encoded.tokens, encoded.padding
         output = self.predict_truth(encoded.summary.unsqueeze(1))
         if self.kl_weight > 0:

@@ -9,7 +9,7 @@ from zipfile import BadZipFile, ZipFile
 
 import torch
 
-from vla.io.documents import resolved
+from vla.io.documents import resolve_config
 from vla.io.errors import UserError
 
 
@@ -24,7 +24,7 @@ class Header(NamedTuple):
 def read_header(path: Path) -> Header:
     """Read the metadata of a checkpoint, in a time that does not depend on its size. Raises as `read_content`."""
     content = read_content(path, weights=False)
-    config, steps = resolved(content.get("config"), f"the configuration in {path}"), content.get("global_step")
+    config, steps = resolve_config(content.get("config"), f"the configuration in {path}"), content.get("global_step")
     if not isinstance(config, dict) or not isinstance(steps, int):
         raise UserError(f"{path} is no checkpoint of this project: it carries no configuration, or no steps")
     return Header(config, content.get("finished") is True, steps)

@@ -22,7 +22,7 @@ from vla.io.types import Positive
 Velocity = Callable[[Tensor, Tensor], Tensor]
 
 
-class Running(NamedTuple):
+class RunningPlans(NamedTuple):
     """The plans being executed, from the times of the observations on."""
 
     actions: Tensor  # (B, k, D) scaled as in the model; only the first `remaining` count
@@ -34,7 +34,7 @@ class Chunking(ABC):
     """How the velocity of a plan's actions is changed so that the plan continues a running one."""
 
     @abstractmethod
-    def continued(self, velocity: Velocity, running: Running) -> Velocity:
+    def continuing_velocity(self, velocity: Velocity, running: RunningPlans) -> Velocity:
         """Return the changed velocity; rows without a running plan keep the original one."""
 
 
@@ -54,7 +54,7 @@ class Guided(Chunking):
     def __init__(self, jacobian: bool, decay: Literal["exponential", "linear"], limit: Positive) -> None:
         self._jacobian, self._decay, self._limit = jacobian, decay, limit
 
-    def continued(self, velocity: Velocity, running: Running) -> Velocity:
+    def continuing_velocity(self, velocity: Velocity, running: RunningPlans) -> Velocity:
         """Return the guided velocity."""
         place = torch.arange(running.actions.shape[1], device=running.actions.device)
         start, end = running.delay.unsqueeze(1), running.remaining.unsqueeze(1)
@@ -76,7 +76,7 @@ class Guided(Chunking):
 class TrainedPrefix(Chunking):
     """The network is given the actions that are executed before the plan arrives, as in training."""
 
-    def continued(self, velocity: Velocity, running: Running) -> Velocity:
+    def continuing_velocity(self, velocity: Velocity, running: RunningPlans) -> Velocity:
         """Return the velocity given the prefix."""
         return lambda noisy, time: velocity(*with_prefix(noisy, time, running.actions, running.delay))
 

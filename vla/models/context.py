@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from vla.io.errors import UserError
 from vla.io.types import Inherited, Natural, Steps, Width
 from vla.models.kinematics import RobotState
-from vla.models.layers import Batch, RunningNormalizer, mlp, newest, pixels
+from vla.models.layers import Batch, RunningNormalizer, mlp, newest_index, pixels
 from vla.models.vision.image_tokenizer import ImageEncoder, Keypoints, TokenLearner
 from vla.spec import Spec
 
 
-class Encoded(NamedTuple):
+class EncodedContext(NamedTuple):
     """The context of B windows."""
 
     tokens: Tensor  # (B, N, E)
@@ -67,7 +67,7 @@ class Context(nn.Module, ABC):
         return None
 
     @abstractmethod
-    def forward(self, batch: Batch, text: Tensor) -> Encoded:
+    def forward(self, batch: Batch, text: Tensor) -> EncodedContext:
         """Return the context at the newest present frame; later padding has no effect. Arguments as in `encode`."""
 
 
@@ -132,13 +132,13 @@ class KeypointContext(Context):
         self.tokens = nn.ModuleList(nn.Linear(features, width) for features in widths)
         self.fuse = nn.Sequential(mlp(sum(widths), 2 * width), nn.Linear(2 * width, width))
 
-    def forward(self, batch: Batch, text: Tensor) -> Encoded:
+    def forward(self, batch: Batch, text: Tensor) -> EncodedContext:
         """Return the context of the newest frame."""
         images, state = self.features(batch, text)
         features = [*images, *state, text]
         summary = self.fuse(torch.cat(features, -1))
         tokens = [linear(feature) for linear, feature in zip(self.tokens, features, strict=True)]
-        return Encoded(torch.stack([summary, *tokens], 1), summary, state=state[0] if state else None)
+        return EncodedContext(torch.stack([summary, *tokens], 1), summary, state=state[0] if state else None)
 
 
 class TokenContext(Context):
@@ -201,14 +201,14 @@ class TokenContext(Context):
             tokens.append(self.proprioception_token(self.proprioception(batch)).unsqueeze(2))
         return torch.cat(tokens, 2)
 
-    def forward(self, batch: Batch, text: Tensor) -> Encoded:
+    def forward(self, batch: Batch, text: Tensor) -> EncodedContext:
         """Return the context of up to `history` frames; positions are aligned at the newest one, which comes last."""
         frames = batch["tokens"] if "tokens" in batch else self.encode(batch, text)
-        frames, present = newest_last(frames, batch["present"])
+        frames, present = roll_newest_last(frames, batch["present"])
         padding = ~present.repeat_interleave(self.per_frame, 1)
         assert self.fusion is not None, "omitted only for models that do not call this"
         tokens = self.fusion(frames, text)
-        return Encoded(tokens, tokens[:, -1], F.pad(padding, (0, 2)))
+        return EncodedContext(tokens, tokens[:, -1], F.pad(padding, (0, 2)))
 
 
 class Fusion(nn.Module):
@@ -239,8 +239,8 @@ class Fusion(nn.Module):
         return self.norm(torch.cat([frame_tokens, instruction, summary], 1))
 
 
-def newest_last(frames: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+def roll_newest_last(frames: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     """Roll (B, T, n, E) frames and their (B, T) mask until the newest present frame is last: 1, 2, - → -, 1, 2."""
     length = present.shape[1]
-    places = (torch.arange(length, device=present.device) + newest(present)[:, None] + 1) % length  # (B, T)
+    places = (torch.arange(length, device=present.device) + newest_index(present)[:, None] + 1) % length  # (B, T)
     return frames.gather(1, places[:, :, None, None].expand_as(frames)), present.gather(1, places)

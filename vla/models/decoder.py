@@ -13,10 +13,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla.io.types import Inherited, Layers, Rate, Width
-from vla.models.context import Encoded
+from vla.models.context import EncodedContext
 from vla.models.layers import Batch, mean_where, require_heads
 from vla.models.model import ContextModel, Prediction
-from vla.models.tokenizers.tokenizer import PerComponent
+from vla.models.tokenizers.tokenizer import ComponentTokenizer
 
 
 class CachedLayer:
@@ -27,7 +27,7 @@ class CachedLayer:
         context: of M tokens.
     """
 
-    def __init__(self, layer: nn.TransformerDecoderLayer, context: Encoded) -> None:
+    def __init__(self, layer: nn.TransformerDecoderLayer, context: EncodedContext) -> None:
         memory, padding = context.tokens, context.padding
         self._layer, self._present = layer, None if padding is None else ~padding[:, None, None]  # (B, 1, 1, M)
         self._memory_key, self._memory_value = _project(layer.multihead_attn, memory, 1, 3)
@@ -63,8 +63,8 @@ class Decoder(ContextModel):
     """`nn.TransformerDecoder` over action tokens, with causal self-attention and cross-attention to the context.
 
     The start token is the summary of the context. The decoder is trained on the newest frame of a window with teacher
-    forcing, where some tokenizers draw the inputs near the labels (`sampled`). Decoding is greedy: the most likely
-    token is fed back each time, and the tokenizer turns the logits and tokens into actions.
+    forcing, where some tokenizers draw the inputs near the labels (`sample_inputs`). Decoding is greedy: the most
+    likely token is fed back each time, and the tokenizer turns the logits and tokens into actions.
 
     Args:
         layers, heads, feedforward: of the decoder; feedforward is the hidden width of its MLPs.
@@ -100,8 +100,8 @@ class Decoder(ContextModel):
         With an auxiliary head also truth: (B, 1, S), normalised. With (B, T, N, E) "tokens", images are not needed.
         """
         tokens = self.tokenizer.tokenize(batch["action"][:, -1])
-        inputs = self.tokenizer.sampled(tokens, batch["action"][:, -1]) if self.training else tokens
-        context = self.encoded(batch)
+        inputs = self.tokenizer.sample_inputs(tokens, batch["action"][:, -1]) if self.training else tokens
+        context = self.encode_context(batch)
         logits = self.head(self.decode(inputs[:, :-1], context))
         return {"logits": logits, "tokens": tokens, **self.predict_truth(context.summary.unsqueeze(1))}
 
@@ -117,13 +117,13 @@ class Decoder(ContextModel):
 
     def predict(self, batch: Batch) -> Prediction:
         """Decode the actions for the newest frame token by token."""
-        logits, tokens = self.generate(self.encoded(batch))
+        logits, tokens = self.generate(self.encode_context(batch))
         actions = self.tokenizer.actions(logits, tokens)
-        if not isinstance(self.tokenizer, PerComponent):
+        if not isinstance(self.tokenizer, ComponentTokenizer):
             return Prediction(actions)
         return Prediction(actions, logits.unflatten(1, (self.chunk, -1)).softmax(-1))
 
-    def decode(self, tokens: Tensor, context: Encoded) -> Tensor:
+    def decode(self, tokens: Tensor, context: EncodedContext) -> Tensor:
         """Map the first n tokens, (B, n), to the hidden states that predict the first n + 1 tokens, (B, n + 1, E)."""
         inputs = torch.cat([context.summary.unsqueeze(1), self.embedding(tokens)], 1)
         length = inputs.shape[1]
@@ -136,7 +136,7 @@ class Decoder(ContextModel):
         )
         return self.norm(hidden)
 
-    def generate(self, context: Encoded) -> tuple[Tensor, Tensor]:
+    def generate(self, context: EncodedContext) -> tuple[Tensor, Tensor]:
         """Decode greedily; returns (B, n, K) float32 logits and (B, n) tokens.
 
         n is L, or less if all sequences of the batch have ended.

@@ -117,7 +117,7 @@ class DenoisingModel(ContextModel):
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return context: (B, M, E), padding: (B, M) unless there is none, and the result of `predict_truth`."""
-        encoded = self.encoded(batch)
+        encoded = self.encode_context(batch)
         padding = {} if encoded.padding is None else {"padding": encoded.padding}
         return {"context": encoded.tokens, **padding, **self.predict_truth(encoded.summary.unsqueeze(1))}
 
@@ -141,7 +141,9 @@ class DenoisingModel(ContextModel):
 
     def predict(self, batch: Batch) -> Prediction:
         """Denoise the "noise" of the batch, or else a fixed noise."""
-        encoded = self.encoded(batch)
+        encoded = self.encode_context(batch)
         noise = batch["noise"] if "noise" in batch else self.noise.expand(len(encoded.tokens), -1, -1)
-        denoise = self.continued(partial(self.denoiser, context=encoded.tokens, padding=encoded.padding), batch)
+        denoise = self.continuing_velocity(
+            partial(self.denoiser, context=encoded.tokens, padding=encoded.padding), batch
+        )
         return Prediction(self.unscaled(self.sample(self.temperature * noise, denoise)))

@@ -42,7 +42,7 @@ def reshard(model: nn.Module) -> None:
 
 
 @contextmanager
-def unsharded(model: nn.Module) -> Iterator[None]:
+def gather_weights(model: nn.Module) -> Iterator[None]:
     """Gather all weights in every process, for calls that bypass `forward`; the weights must not be changed."""
     for part in _sharded_parts(model):
         part.unshard()

@@ -93,7 +93,7 @@ def random_arguments(training: bool, device: torch.device) -> dict[str, Any]:
     return {"device": device} if training else {"generator": torch.Generator().manual_seed(0)}
 
 
-def newest(present: Tensor) -> Tensor:
+def newest_index(present: Tensor) -> Tensor:
     """Return the (B,) index of the last of the (B, T) frames that is present."""
     return (present * torch.arange(1, present.shape[1] + 1, device=present.device)).argmax(1)
 

@@ -15,10 +15,10 @@ from torch import Tensor, distributed, nn
 from torchmetrics import MeanMetric
 
 from vla.io.errors import UserError
-from vla.io.printable import readable
+from vla.io.printable import display_unit
 from vla.io.types import Natural, NonNegative, Positive, Rate
 from vla.models.compile_cache import set_compile_cache
-from vla.models.fsdp import local_shard, shard, unsharded
+from vla.models.fsdp import gather_weights, local_shard, shard
 from vla.models.layers import Batch
 from vla.models.lora import LoRA
 from vla.models.model import Model
@@ -207,11 +207,11 @@ class Learner(LightningModule):
         """Log the losses, and the error of the predicted actions of the newest frame per component."""
         for name, value in self.model.loss(batch).items():
             self.log(f"val/{name}", value, batch_size=len(batch["action"]), sync_dist=True)
-        with unsharded(self.model):
+        with gather_weights(self.model):
             actions = self.model.predict(batch).actions
         error = (actions - batch["action"][:, -1]).abs()[batch["valid"][:, -1]]  # (N, D)
         for index, (name, unit) in enumerate(zip(self._spec.action, self._spec.units, strict=True)):
-            factor, unit_name = readable(unit)
+            factor, unit_name = display_unit(unit)
             metric = self.errors[index]
             assert isinstance(metric, MeanMetric)
             metric.update(error[:, index] * factor)

@@ -74,8 +74,8 @@ class LoRA:
         return list(targets)
 
 
-def without_lora(state: Mapping[str, Any], scale: float, named: Collection[str]) -> dict[str, Any]:
-    """Return the state of a model with its LoRA factors merged into the weights, and without the trunks `named`.
+def without_lora(state: Mapping[str, Any], scale: float, parts: Collection[str]) -> dict[str, Any]:
+    """Return the state of a model with its LoRA factors merged into the weights, and without the trunks `parts`.
 
     The factors in a trunk are not merged: they remain, as lora_A and the scaled lora_B.
     """
@@ -84,9 +84,9 @@ def without_lora(state: Mapping[str, Any], scale: float, named: Collection[str])
         layer, _, kind = name.partition(".base_layer.")
         factor = f"{layer}.lora_%s.{ADAPTER}.weight"
         if is_factor(name):
-            if is_within(name, named):
+            if is_within(name, parts):
                 result[name.removesuffix(f".{ADAPTER}.weight")] = scale * value if ".lora_B." in name else value
-        elif is_within(name, named):
+        elif is_within(name, parts):
             continue
         elif kind == "weight":
             result[f"{layer}.weight"] = value + scale * (state[factor % "B"] @ state[factor % "A"])

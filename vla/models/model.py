@@ -15,12 +15,12 @@ from torch import Tensor, nn
 
 from vla.io.errors import UserError
 from vla.io.types import ImageSize, Inherited, NonNegative, Shift, Steps, Width
-from vla.models.chunking import Chunking, Running, Velocity
-from vla.models.context import Context, Encoded
+from vla.models.chunking import Chunking, RunningPlans, Velocity
+from vla.models.context import Context, EncodedContext
 from vla.models.kinematics import RobotState
-from vla.models.layers import Batch, RunningNormalizer, mean_where, newest
+from vla.models.layers import Batch, RunningNormalizer, mean_where, newest_index
 from vla.models.text.ngrams import TextEncoder
-from vla.models.tokenizers.tokenizer import ActionTokenizer, PerComponent
+from vla.models.tokenizers.tokenizer import ActionTokenizer, ComponentTokenizer
 from vla.models.transforms import Fit, Transforms
 from vla.models.trunk import is_factor, is_within
 from vla.models.vision.image_tokenizer import ImageEncoder, RandomShift
@@ -43,7 +43,7 @@ class Model(nn.Module, ABC):
         loss mask, true for a prefix of each chunk; executed: the executed actions, in the shape of action;
         perturbations: (B, T, k) int, perturbed steps before each label, -1 beyond the episode; truth: (B, T, S)
         float32. For generative models optionally noise: (B, k, D) float32, standard normal; for plans that continue
-        running ones also running: (B, k, D) float32, and remaining and delay: (B,), see `chunking.Running`.
+        running ones also running: (B, k, D) float32, and remaining and delay: (B,), see `chunking.RunningPlans`.
 
     A policy executes the first `execute` of the k actions before it predicts again.
 
@@ -138,12 +138,12 @@ class Model(nn.Module, ABC):
         """Return truth: (B, T', S), normalised, given (B, T', width) features; nothing without an auxiliary head."""
         return {} if self.truth_head is None else {"truth": self.truth_head(features)}
 
-    def continued(self, velocity: Velocity, batch: Batch) -> Velocity:
+    def continuing_velocity(self, velocity: Velocity, batch: Batch) -> Velocity:
         """Return a velocity that continues the running plans of a batch, if it has any."""
         if self.chunking is None or "running" not in batch:
             return velocity
-        running = Running(self.scaled(batch["running"]), batch["remaining"], batch["delay"])
-        return self.chunking.continued(velocity, running)
+        running = RunningPlans(self.scaled(batch["running"]), batch["remaining"], batch["delay"])
+        return self.chunking.continuing_velocity(velocity, running)
 
     def scaled(self, action: Tensor) -> Tensor:
         """Scale (…, D) actions so that the bounds of the tokenizer become -1 and 1; nothing is clipped."""
@@ -266,7 +266,7 @@ class ContextModel(Model):
         """Return tokens of each frame, as `Context.encode`."""
         return self.context.encode(batch, self.text(batch["text"]))
 
-    def encoded(self, batch: Batch) -> Encoded:
+    def encode_context(self, batch: Batch) -> EncodedContext:
         """Return the context of a batch, in which "tokens" may take the place of images and states."""
         return self.context(batch, self.text(batch["text"]))
 
@@ -277,9 +277,9 @@ class TokenModel(Model):
     Its `forward` returns logits: (B, T', k, D, K).
     """
 
-    tokenizer: PerComponent
+    tokenizer: ComponentTokenizer
 
-    def __init__(self, *, tokenizer: PerComponent, **inherited: Inherited) -> None:
+    def __init__(self, *, tokenizer: ComponentTokenizer, **inherited: Inherited) -> None:
         super().__init__(tokenizer=tokenizer, **inherited)
 
     @property
@@ -300,7 +300,7 @@ class TokenModel(Model):
 
     def predict(self, batch: Batch) -> Prediction:
         """Decode the logits of the newest frame."""
-        frame, logits = newest(batch["present"]), self(batch)["logits"]
+        frame, logits = newest_index(batch["present"]), self(batch)["logits"]
         if logits.shape[1] != batch["present"].shape[1]:
             raise UserError(f"{type(self).__name__}.forward must return logits for every frame of its history")
         logits = logits[torch.arange(len(frame), device=frame.device), frame].float()  # (B, k, D, K)

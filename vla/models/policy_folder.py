@@ -22,13 +22,13 @@ from vla.io.types import Natural, Seed
 from vla.models.hub import HUB, fetch
 from vla.models.model import Model
 from vla.models.trunk import Source, require_trunks, whole_state
-from vla.models.trunk_folder import opened
+from vla.models.trunk_folder import open_safetensors
 from vla.parallel.limits import free_memory
 from vla.spec import Spec
 
 POLICY, BEST = "policy", "policy_best"  # in the folder of a run: its policy, and the best one in validation
 CONFIG, SPEC, WEIGHTS, TRAINING, CARD = "config.json", "spec.json", "model.safetensors", "training.json", "README.md"
-FURTHER = "state"  # key in the metadata of the weights: state of modules that is no tensor, as JSON
+MODULE_STATE = "state"  # key in the metadata of the weights: state of modules that is no tensor, as JSON
 REQUIRED_NODES = ("task", "tokenizer", "model")  # of the config
 OPTIONAL_NODES = ("policy", "chosen", "expert", "collect", "data", "learner", "trainer", "validate")
 TRUTH_MODULES = ("truth_head", "truth_scale")  # modules of a model used in training only
@@ -75,9 +75,9 @@ class SavedPolicy:
         with path.open("rb") as file:
             if hashlib.file_digest(file, "sha256").hexdigest() != self.training.weights:
                 raise UserError(f"{path} is damaged, or not the file that {TRAINING} describes: copy the folder again")
-        with opened(path) as weights:
+        with open_safetensors(path) as weights:
             names: list[str] = weights.keys()  # it is no mapping
-            further_state = parse_json((weights.metadata() or {}).get(FURTHER, "{}"), dict[str, Any], str(path))
+            further_state = parse_json((weights.metadata() or {}).get(MODULE_STATE, "{}"), dict[str, Any], str(path))
             return further_state | {name: weights.get_tensor(name) for name in names}
 
     def initialize(self, model: Model) -> None:
@@ -177,7 +177,7 @@ def read_policy(name: str | Path) -> SavedPolicy:
     present_nodes = [nodes[name] for name in (*REQUIRED_NODES, *OPTIONAL_NODES) if name in nodes]
     if not nodes.keys() >= {*REQUIRED_NODES} or not all(isinstance(node, dict) for node in present_nodes):
         raise UserError(f"{folder / CONFIG} is of no policy of this project: it needs {', '.join(REQUIRED_NODES)}")
-    with opened(_file(folder, WEIGHTS)):
+    with open_safetensors(_file(folder, WEIGHTS)):
         pass  # safetensors checks that the sizes of weights in the header match that of the file
     record = parse_plain(training, Training, str(folder / TRAINING))
     return SavedPolicy(folder, nodes, Spec.from_dict(spec, str(folder / SPEC)), record)

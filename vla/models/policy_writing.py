@@ -71,7 +71,7 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
     }
     # One string, because safetensors writes several in random order, and equal policies must have equal digests.
     further_state = json.dumps({name: value for name, value in state.items() if name not in tensors})
-    weights = save(tensors, {files.FURTHER: further_state})
+    weights = save(tensors, {files.MODULE_STATE: further_state})
     training = files.Training(
         steps=content["global_step"],
         windows=next((part["windows"] for part in states if isinstance(part.get("windows"), str)), ""),

@@ -96,7 +96,7 @@ class RT1(ContextModel, TokenModel):
         There may be fewer frames than `history`. A batch with (B, T, N, E) "tokens" from `encode` needs no images.
         """
         frames = batch["tokens"] if "tokens" in batch else self.encode(batch)
-        tokens, inverse_order = oldest_first(frames, batch["present"])
+        tokens, inverse_order = roll_oldest_first(frames, batch["present"])
         empty_slots = tokens.new_zeros(*tokens.shape[:2], self.slots, tokens.shape[-1])
         hidden = self.transform(torch.cat([tokens, empty_slots], 2).flatten(1, 2))
         hidden = hidden.unflatten(1, (tokens.shape[1], -1))  # (B, T, N + A, E)
@@ -114,7 +114,7 @@ class RT1(ContextModel, TokenModel):
         return x
 
 
-def oldest_first(frames: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+def roll_oldest_first(frames: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     """Roll (B, T, N, E) frames until the oldest present one is first, -, 1, 2 → 1, 2, -; also return (B, T) places that
     undo it. A policy's first frames have these positions too, in which none attends to absent frames."""
     steps, offset = torch.arange(present.shape[1], device=present.device), present.int().argmax(1, keepdim=True)

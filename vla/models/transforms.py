@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from vla.io.images import Fit, fitted
+from vla.io.images import Fit, fit_images
 from vla.models.layers import Batch
 
 
@@ -33,7 +33,7 @@ class Transforms:
     def __call__(self, batch: Batch) -> Batch:
         """Return the input of a model: its images have `image_size`, and "text" is there, made of "instruction"."""
         # Cropped regardless of `fit`, as by importers, which know no model, so that robots show what they stored.
-        rgb = {camera: fitted(images, self.demonstrations, "crop") for camera, images in batch["rgb"].items()}
-        rgb = {camera: fitted(images, self.size, self.fit) for camera, images in rgb.items()}
+        rgb = {camera: fit_images(images, self.demonstrations, "crop") for camera, images in batch["rgb"].items()}
+        rgb = {camera: fit_images(images, self.size, self.fit) for camera, images in rgb.items()}
         text = batch["text"] if "text" in batch else self.tokenize(batch["instruction"]).to(batch["state"].device)
         return {**batch, "rgb": rgb, "text": text}

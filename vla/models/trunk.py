@@ -27,7 +27,7 @@ class Source:
     size: Natural  # of the file [bytes]
 
     @classmethod
-    def of(cls, path: Path, name: str) -> Source:
+    def from_file(cls, path: Path, name: str) -> Source:
         """Return the source of weights that were read from a file, which may lie in the hub's cache."""
         folder = path.absolute().parent
         revision = folder.name if folder.parent.name == "snapshots" else None
@@ -68,27 +68,27 @@ def evaluate_frozen(module: nn.Module) -> None:
         part.train(is_factor(f".{name}."))
 
 
-def require_trunks(model: nn.Module, named: Mapping[str, Source], policy: object) -> None:
+def require_trunks(model: nn.Module, sources: Mapping[str, Source], policy: object) -> None:
     """Require the trunks that a policy names.
 
     Raises:
         UserError: a trunk is missing, or differs from the one in training.
     """
     modules: dict[str, Any] = dict(model.named_modules())
-    for part, source in named.items():
+    for part, source in sources.items():
         if (model_source := getattr(modules.get(part), "source", None)) is None or model_source.sha256 != source.sha256:
             text = f"here it is {model_source}" if model_source else "that is not here"
             raise UserError(f"{policy} was trained with {part} from {source}, and {text}: get the one of the training")
 
 
-def whole_state(model: nn.Module, state: Mapping[str, Any], named: Collection[str]) -> dict[str, Any]:
-    """Return the state of a policy with that of the trunks `named`, into which their LoRA factors are merged.
+def whole_state(model: nn.Module, state: Mapping[str, Any], parts: Collection[str]) -> dict[str, Any]:
+    """Return the state of a policy with that of the trunks `parts`, into which their LoRA factors are merged.
 
     The attribute `source` becomes None on every module whose weights in this state differ from those of its source.
     """
-    result = {name: value for name, value in state.items() if not (is_factor(name) and is_within(name, named))}
+    result = {name: value for name, value in state.items() if not (is_factor(name) and is_within(name, parts))}
     changed_layers = set[str]()  # linear maps
-    for part in named:
+    for part in parts:
         for name, value in model.get_submodule(part).state_dict(prefix=f"{part}.").items():
             layer = name.removesuffix(".weight")
             if f"{layer}.lora_A" in state:
@@ -96,7 +96,7 @@ def whole_state(model: nn.Module, state: Mapping[str, Any], named: Collection[st
                 changed_layers.add(layer)
             result[name] = value
     for name, module in model.named_modules():
-        unchanged = is_within(name, named) and not any(is_within(layer, [name]) for layer in changed_layers)
+        unchanged = is_within(name, parts) and not any(is_within(layer, [name]) for layer in changed_layers)
         if isinstance(getattr(module, "source", None), Source) and not unchanged:
             module.source = None  # type: ignore[assignment]
     return result

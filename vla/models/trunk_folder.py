@@ -15,7 +15,7 @@ from vla.models.hub import HUB, fetch
 CONFIG, WEIGHTS = "config.json", "model*.safetensors"
 FILES = (CONFIG, "policy_*", WEIGHTS)
 ADVICE = "give the folder of a download, or leave it out for random weights"
-OF_OTHERS = ("model_type", "input_features")  # in the config of transformers, and of a policy of LeRobot
+FOREIGN_KEYS = ("model_type", "input_features")  # in the config of transformers, and of a policy of LeRobot
 
 
 def is_trunk(name: str) -> bool:
@@ -35,9 +35,9 @@ def is_trunk(name: str) -> bool:
     if not (folder / CONFIG).is_file():
         return False
     config = read_json(folder / CONFIG, dict[str, Any])
-    if config.keys().isdisjoint((*OF_OTHERS, "model")):
-        raise UserError(f"{folder / CONFIG} has neither {' nor '.join(OF_OTHERS)}: download the model again")
-    return not config.keys().isdisjoint(OF_OTHERS)
+    if config.keys().isdisjoint((*FOREIGN_KEYS, "model")):
+        raise UserError(f"{folder / CONFIG} has neither {' nor '.join(FOREIGN_KEYS)}: download the model again")
+    return not config.keys().isdisjoint(FOREIGN_KEYS)
 
 
 def trunk_folder(name: str) -> Path:
@@ -53,7 +53,7 @@ def trunk_folder(name: str) -> Path:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def open_safetensors(path: Path) -> Iterator[Any]:
     """Open a safetensors file, whose header is checked; a UserError if it is damaged, or no file."""
     from safetensors import safe_open
 

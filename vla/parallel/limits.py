@@ -42,7 +42,7 @@ def free_memory() -> int:
     return min(free for _, free in _limits())
 
 
-def scarce_memory(share: float) -> bool:
+def is_memory_scarce(share: float) -> bool:
     """Return whether less than a share of the memory is free, of the machine or of a control group."""
     return any(free < share * total for total, free in _limits())
 

@@ -28,7 +28,7 @@ class WorkersLost(UserError):
     """Loss of workers that crashed or were killed; a retry with new ones may succeed."""
 
 
-class Crashed(WorkersLost):
+class WorkerCrash(WorkersLost):
     """Crash of every process that attempted one item; other items are not affected."""
 
 
@@ -109,7 +109,7 @@ class ProcessPool(AbstractContextManager["ProcessPool"]):
     def submit(self, item: Any) -> futures.Future[Any]:
         """Process an item as soon as a process is idle.
 
-        The future raises the error of the worker factory or of the attempt, `Crashed` if two processes ended in
+        The future raises the error of the worker factory or of the attempt, `WorkerCrash` if two processes ended in
         succession, or a UserError if one ended before its worker existed.
         """
         return self._threads.submit(self._attempt, item)
@@ -150,7 +150,7 @@ class ProcessPool(AbstractContextManager["ProcessPool"]):
             return self._ask(item)
         except ProcessEnded as end:
             way_out = "lower cluster.workers, or set PYTHONFAULTHANDLER=1 to see where"
-            raise Crashed(f"a worker process crashed twice: {end}; {way_out}") from end
+            raise WorkerCrash(f"a worker process crashed twice: {end}; {way_out}") from end
 
     def _ask(self, item: Any) -> Any:
         process = self._process()

@@ -125,12 +125,12 @@ def _outcome(function: Callable[..., Any], *arguments: Any) -> bytes:
     try:
         return pickle.dumps((function(*arguments), None))
     except Exception as error:  # any error, also of pickling: the parent raises it
-        portable_error = portable(error)
+        portable_error = make_picklable(error)
         portable_error.add_note(f"\nIn the worker process:\n{traceback.format_exc()}")
         return pickle.dumps((None, portable_error))
 
 
-def portable(error: BaseException) -> BaseException:
+def make_picklable(error: BaseException) -> BaseException:
     """Return the error, or a RuntimeError with its text if it cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(error))
@@ -170,7 +170,7 @@ def spin_briefly() -> None:
 
 
 @contextmanager
-def stopped_by(*signals: signal.Signals) -> Iterator[threading.Event]:
+def signal_event(*signals: signal.Signals) -> Iterator[threading.Event]:
     """Yield an event that these signals set within the context."""
     event = threading.Event()
     handlers = {number: signal.signal(number, lambda *_: event.set()) for number in signals}

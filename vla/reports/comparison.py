@@ -8,19 +8,19 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from vla.config.differences import at
+from vla.config.differences import value_at
 from vla.config.nodes import conditions, with_changes
 from vla.io.errors import UserError
 from vla.reports.result_tables import secondary_table
 from vla.reports.tables import DIFFERENCE, Table, difference
-from vla.rollouts.comparison import SUCCESS, Comparison, compare_samples, compared_in, concluded
+from vla.rollouts.comparison import SUCCESS, Comparison, compare_results, compare_samples, conclude_cases
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.statistics import effective_episodes
 from vla.runs.folder import Run, require_run
 from vla.runs.sweep import SweepRow
 
 # Names of the second row, of the first one, and condition → what is compared → comparison.
-Compared = Mapping[tuple[str, ...], Mapping[str, Comparison]]
+Comparisons = Mapping[tuple[str, ...], Mapping[str, Comparison]]
 CASE = ("second", "minus first", "condition")
 
 
@@ -42,7 +42,7 @@ def rows_of(runs: Mapping[str, Run]) -> list[SweepRow]:
     return [SweepRow({"run": name}, [run]) for name, run in runs.items()]
 
 
-def compare(pairs: Iterable[tuple[SweepRow, SweepRow]], margin: float) -> Compared:
+def compare(pairs: Iterable[tuple[SweepRow, SweepRow]], margin: float) -> Comparisons:
     """Compare pairs of rows under each condition that both played in the same world.
 
     Single trainings are compared on the episodes that both played, by paired tests and in secondary metrics; without
@@ -53,17 +53,17 @@ def compare(pairs: Iterable[tuple[SweepRow, SweepRow]], margin: float) -> Compar
     comparisons: dict[tuple[str, ...], dict[str, Comparison]] = {
         (other.name, one.name, condition): metrics
         for one, other in pairs
-        for condition in one.played
-        if condition in other.played
+        for condition in one.successes
+        if condition in other.successes
         and not _repeats_training_condition((*one.runs, *other.runs), condition)
         and (metrics := _compare_rows(one, other, condition))
     }
-    return concluded(comparisons, margin)
+    return conclude_cases(comparisons, margin)
 
 
 def _repeats_training_condition(runs: Sequence[Run], condition: str) -> bool:
     """Return whether a condition changes the task of none of the runs, so that its episodes are those of `seen`."""
-    tasks = [(at(run.report.config, "task", {}), _changes(run, condition)) for run in runs if run.report]
+    tasks = [(value_at(run.report.config, "task", {}), _changes(run, condition)) for run in runs if run.report]
     return all(changes is not None and with_changes(task, changes) == task for task, changes in tasks)
 
 
@@ -73,7 +73,7 @@ def _compare_rows(one: SweepRow, other: SweepRow, condition: str) -> dict[str, C
     reports = [run.reports[condition] for row in (one, other) for run in row.runs if condition in run.reports]
     anytime = any(report.anytime for report in reports)
     if len(one.runs) == len(other.runs) == 1 and (together := common_episodes(*runs, condition)):
-        return compared_in(together, anytime)
+        return compare_results(together, anytime)
     first, second = (_by_seed(run, condition) for run in runs)
     if common_seeds := first.keys() & second.keys():  # then each of them must be of the same world in both samples
         same_world = all(first[seed][1] == second[seed][1] for seed in common_seeds)
@@ -81,15 +81,15 @@ def _compare_rows(one: SweepRow, other: SweepRow, condition: str) -> dict[str, C
         same_world = _scenes(runs[0], condition) == _scenes(runs[1], condition)
     if anytime or not (first and second and same_world):
         return {}
-    samples = [effective_episodes(row.played[condition]) for row in (one, other)]
+    samples = [effective_episodes(row.successes[condition]) for row in (one, other)]
     episodes = one.episodes[condition] + other.episodes[condition]
     return {SUCCESS: replace(compare_samples(*samples[0], *samples[1]), episodes=episodes)}
 
 
-def remarks(runs: Mapping[str, Run], compared: Compared | None = None) -> dict[str, str]:
+def remarks(runs: Mapping[str, Run], comparisons: Comparisons | None = None) -> dict[str, str]:
     """Return remark → the names of the runs that it concerns; given comparisons, also the pairs that have none."""
-    compared_pairs = {(one, other) for other, one, _ in compared or ()}
-    pairs = [] if compared is None else [pair for pair in combinations(runs, 2) if pair not in compared_pairs]
+    compared_pairs = {(one, other) for other, one, _ in comparisons or ()}
+    pairs = [] if comparisons is None else [pair for pair in combinations(runs, 2) if pair not in compared_pairs]
     versions: dict[str, dict[str, None]] = {}  # library → its versions, in order and without repetition
     for run in runs.values():
         for library, version in run.report.versions.items() if run.report else ():
@@ -108,10 +108,10 @@ def remarks(runs: Mapping[str, Run], compared: Compared | None = None) -> dict[s
     return {remark: ", ".join(names) for remark, names in names_by_remark.items() if names}
 
 
-def difference_tables(compared: Compared) -> list[Table]:
+def difference_tables(comparisons: Comparisons) -> list[Table]:
     """Tabulate comparisons of success, and those of milestones and motion."""
     details, rows = ("only the first succeeds", "only the second succeeds"), []
-    for case, metrics in compared.items():
+    for case, metrics in comparisons.items():
         comparison = metrics[SUCCESS]
         counts = ["" if count is None else str(count) for count in (comparison.only_first, comparison.only_second)]
         rows.append([*case, str(comparison.episodes), *counts, *difference(comparison)])
@@ -120,7 +120,7 @@ def difference_tables(compared: Compared) -> list[Table]:
         "compare different episodes of the same world, or several trainings."
     )
     heads = (*CASE, "episodes", *details, *DIFFERENCE)
-    return [Table(heads, rows, "Differences in success", note, (*details, "p")), secondary_table(compared, CASE)]
+    return [Table(heads, rows, "Differences in success", note, (*details, "p")), secondary_table(comparisons, CASE)]
 
 
 def common_episodes(one: Run, other: Run, condition: str) -> list[tuple[Result, Result]]:
@@ -143,12 +143,12 @@ def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
 def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
     """Return the config values that determine the scenes: the task with the changes of a condition, and its network."""
     config, changes = run.report.config if run.report else {}, _changes(run, condition)
-    task = at(config, "task")
+    task = value_at(config, "task")
     world = with_changes(task, changes) if changes and isinstance(task, dict) else task
-    return world, changes is None, at(config, "evaluate.networks", {}).get(condition)
+    return world, changes is None, value_at(config, "evaluate.networks", {}).get(condition)
 
 
 def _changes(run: Run, condition: str) -> dict[str, Any] | None:
     """Return what a condition changes in the task; None if it changes the agent, or is unknown."""
-    evaluate = at(run.report.config if run.report else {}, "evaluate", {})
+    evaluate = value_at(run.report.config if run.report else {}, "evaluate", {})
     return conditions(evaluate.get("conditions", {}), evaluate.get("one_by_one", {})).get(condition)

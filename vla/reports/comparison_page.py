@@ -12,9 +12,9 @@ from urllib.parse import quote
 from markupsafe import Markup
 from matplotlib.axes import Axes
 
-from vla.config.differences import ABSENT, at, differences
+from vla.config.differences import ABSENT, differences, value_at
 from vla.io.files import warn_on_error, write_text
-from vla.reports.comparison import Compared, compare, difference_tables, remarks
+from vla.reports.comparison import Comparisons, compare, difference_tables, remarks
 from vla.reports.page import Section, render
 from vla.reports.pictures import COLOURS, Panels, error_bars, plot_rates, save, svgs
 from vla.reports.tables import Table, config_value, duration, links, percent, rate
@@ -29,7 +29,7 @@ FAILURES = 3  # moving pictures per run
 
 
 def write_comparison(
-    page: Path, title: str, rows: Sequence[SweepRow], compared: Compared, facts: Mapping[str, str]
+    page: Path, title: str, rows: Sequence[SweepRow], comparisons: Comparisons, facts: Mapping[str, str]
 ) -> Path:
     """Write a page on rows and their comparisons; return its path. Raises a UserError if a moving picture is damaged.
 
@@ -44,7 +44,7 @@ def write_comparison(
         results_table(rows, page.parent),
         Section("Remarks", facts=facts),
         Section("Success", panels=svgs(success_panels(rows)), lines=legend),
-        *difference_tables(compared),
+        *difference_tables(comparisons),
         *training_sections([(colour, run.metrics) for _, colour, run in cells]),
         _config_differences(shown_runs),
         *(_failures(name, run) for name, run in shown_runs.items()),
@@ -56,7 +56,7 @@ def tabulate(folder: Path) -> list[SweepRow]:
     """Write the table of a sweep's folder and return its rows; without any report, write nothing."""
     rows = read_rows(folder)
     if rows:
-        margin = at(rows[0].runs[0].config, "evaluate.margin", 0.0)
+        margin = value_at(rows[0].runs[0].config, "evaluate.margin", 0.0)
         compared = compare(((rows[0], other) for other in rows[1:]), margin)
         failure_lines = failures(folder)
         tables = [results_table(rows), *(difference_tables(compared)[:1] if compared else [])]
@@ -77,7 +77,7 @@ def results_table(rows: Sequence[SweepRow], folder: Path | None = None) -> Table
     costs = [*(["each seed [%]"] if seeds else []), "parameters [M]", "action [ms]", "steps", "training"]
     lines = []
     for row in rows:
-        rates = [rate(row.interval(condition)) if condition in row.played else ABSENT for condition in conditions]
+        rates = [rate(row.interval(condition)) if condition in row.successes else ABSENT for condition in conditions]
         lines.append([*row.choices.values(), *rates, *_costs(row, seeds), *([_links(row, folder)] if folder else [])])
     heads = [*rows[0].choices, *(f"{name} [%]" for name in conditions), *costs, *(["pages"] if folder else [])]
     details = [f"{name} [%]" for name in conditions[1:]] if len(conditions) > CONDITIONS else []
@@ -108,7 +108,7 @@ def success_panels(rows: Sequence[SweepRow]) -> Panels:
         return {name: partial(_plot_demonstrations, rows=rows, condition=name) for name in conditions_of(list(rows))}
     panels: Panels = {}
     for condition in conditions_of(list(rows)):
-        rates = {row.name: row.interval(condition) for row in rows if condition in row.played}
+        rates = {row.name: row.interval(condition) for row in rows if condition in row.successes}
         panels[condition] = partial(plot_rates, rates=rates, colours=_legend(rows))
     return panels
 
@@ -122,7 +122,7 @@ def _plot_demonstrations(axes: Axes, rows: Sequence[SweepRow], condition: str) -
     """Plot success under one condition over the number of demonstrations, a line per other choice."""
     lines: dict[str, list[SweepRow]] = {}
     for row in sorted(rows, key=_demonstrations):
-        if condition in row.played:
+        if condition in row.successes:
             choices = [value for key, value in row.choices.items() if key != DEMONSTRATIONS]
             lines.setdefault(" ".join(choices), []).append(row)
     for (name, line), colour in zip(lines.items(), cycle(COLOURS), strict=False):
@@ -138,14 +138,14 @@ def _plot_demonstrations(axes: Axes, rows: Sequence[SweepRow], condition: str) -
 
 def _demonstrations(row: SweepRow) -> int:
     choice = row.choices[DEMONSTRATIONS]  # "default" in a cell of another sweep in the folder
-    return int(choice) if choice.isdecimal() else int(at(row.runs[0].config, DEMONSTRATIONS, 0))
+    return int(choice) if choice.isdecimal() else int(value_at(row.runs[0].config, DEMONSTRATIONS, 0))
 
 
 def _config_differences(runs: Mapping[str, Run]) -> Table:
     """Tabulate the dotted keys that differ, with their value in each run."""
     config, *configs = [run.config for run in runs.values()] or [{}]
     keys = dict.fromkeys(key for other in configs for key, _, _ in differences(config, other))
-    rows = [[key, *(config_value(at(run.config, key)) for run in runs.values())] for key in keys]
+    rows = [[key, *(config_value(value_at(run.config, key)) for run in runs.values())] for key in keys]
     return Table(["key", *runs], rows, "Differences in configuration")
 
 

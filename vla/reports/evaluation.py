@@ -21,12 +21,12 @@ def write_report(
     config: Mapping[str, Any],
     facts: Mapping[str, Any] | None = None,
     conditions: Mapping[str, Report] | None = None,
-    compared: Mapping[str, Mapping[str, Comparison]] | None = None,
+    comparisons: Mapping[str, Mapping[str, Comparison]] | None = None,
 ) -> None:
     """Write the report of the first condition as JSON atomically, with the evaluated policy and the resolved config.
 
     `facts` are further entries, such as chosen options, parameters and latency. `conditions` are the reports of other
-    conditions on the same seeds, `compared` their comparisons with the first.
+    conditions on the same seeds, `comparisons` their comparisons with the first.
     """
     content = {
         **summary(report),
@@ -36,7 +36,7 @@ def write_report(
         "conditions": {
             name: {
                 **summary(other),
-                "compared": {key: asdict(comparison) for key, comparison in (compared or {}).get(name, {}).items()},
+                "compared": {key: asdict(comparison) for key, comparison in (comparisons or {}).get(name, {}).items()},
                 "outcomes": [result.outcome for result in other.results],
                 "reached": [result.milestones for result in other.results],
                 "motions": [result.motion and asdict(result.motion) for result in other.results],
@@ -65,7 +65,7 @@ def summary(report: Report) -> dict[str, Any]:
     }
     for kind, rates in report.rates.items():
         content[kind] = {name: {"rate": counted.rate, **counted._asdict()} for name, counted in rates.items()}
-    for name, mean in (("mean_in_a_row", report.mean_in_a_row), ("mean_over_tiers", report.mean_over_tiers)):
+    for name, mean in (("mean_in_a_row", report.mean_completed), ("mean_over_tiers", report.mean_over_tiers)):
         if mean:
             content[name] = dict(zip(("mean", "ci_low", "ci_high"), mean, strict=True))
     return content

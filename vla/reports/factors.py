@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from vla.data.episode_filter import flat
+from vla.data.episode_filter import flatten
 from vla.reports.pictures import GREEN, GREY, RED, Panels, error_bars, plot_counts, rate_limits
 from vla.reports.tables import in_words
 from vla.rollouts.results import ERROR, Rate, Report, Result
@@ -20,12 +20,12 @@ GROUPS, FACTORS = 8, 8  # maximum number of groups of a factor, and of factors t
 LENGTH_BINS = 30  # approximate number of bars in the histogram of lengths
 
 
-def factors(played: Sequence[Result]) -> dict[str, list[Any]]:
+def factors(results: Sequence[Result]) -> dict[str, list[Any]]:
     """Return name → value per episode, for every draw that all episodes have and that forms 2 to `GROUPS` groups.
 
     A pair of floats is a point; each item of any other list is a factor. Of draws with equal values the first counts.
     """
-    rows = [dict(item for draw in flat(result.draws).items() for item in _items(*draw)) for result in played]
+    rows = [dict(item for draw in flatten(result.draws).items() for item in _items(*draw)) for result in results]
     columns = dict[str, list[Any]]()
     for name in rows[0] if rows else ():
         values = [row.get(name) for row in rows]
@@ -45,7 +45,7 @@ def _items(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield name, value
 
 
-def numeric(values: Sequence[Any]) -> bool:
+def are_numeric(values: Sequence[Any]) -> bool:
     """Return whether all values are numbers."""
     return all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
 
@@ -54,15 +54,15 @@ def groups(values: Sequence[Any]) -> list[list[int]]:
     """Group the indices of episodes: few values or words by value, other numbers by quantiles, points by quadrants."""
     if isinstance(values[0], tuple):
         values = [str(quarter) for quarter in np.array(values) > np.median(values, axis=0)]
-    levels = sorted(set(values), key=None if numeric(values) else str)
-    if len(levels) <= BINS or not numeric(values):
+    levels = sorted(set(values), key=None if are_numeric(values) else str)
+    if len(levels) <= BINS or not are_numeric(values):
         return [[index for index, other in enumerate(values) if other == value] for value in levels]
     return [group.tolist() for group in np.array_split(np.argsort(values, kind="stable"), BINS)]
 
 
-def association(values: Sequence[Any], played: Sequence[Result]) -> float:
+def association(values: Sequence[Any], results: Sequence[Result]) -> float:
     """Association of success, which must vary, with a factor: Pearson's χ² per degree of freedom, about 1 by chance."""
-    successes = np.array([result.success for result in played], dtype=float)
+    successes = np.array([result.success for result in results], dtype=float)
     rate, split = successes.mean(), groups(values)
     squares = sum(len(group) * (successes[group].mean() - rate) ** 2 for group in split)
     return float(squares / (rate * (1 - rate)) / (len(split) - 1))
@@ -120,7 +120,7 @@ def _rates_of(values: Sequence[Any], played: Sequence[Result]) -> list[Rate]:
 def _plot_rates(axes: Axes, values: Sequence[Any], rates: Sequence[Rate], limits: tuple[float, float]) -> None:
     """Plot the success rate with its interval per group of values; a group of numbers is placed at its mean."""
     split = groups(values)
-    if numeric(values):
+    if are_numeric(values):
         places = [float(np.mean([values[index] for index in group])) for group in split]
         whole = all(isinstance(value, int) for value in values)
         axes.locator_params(axis="x", nbins=4, integer=whole)  # long tick labels would overlap

@@ -11,13 +11,13 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 
-from vla.data.episode_filter import flat, leaves
-from vla.io.printable import readable
+from vla.data.episode_filter import flatten, leaves
+from vla.io.printable import display_unit
 from vla.reports.pictures import GREEN, MIDDLE, Panels, plot_image, save
 from vla.reports.tables import Table
 from vla.spec import Array, Observation, Spec
 
-SHOWN = 6  # windows of the first training batch
+SHOWN_WINDOWS = 6  # windows of the first training batch
 
 
 def reset_panels(seeds: Sequence[int], observations: Sequence[Observation]) -> Panels:
@@ -37,7 +37,7 @@ def reset_panels(seeds: Sequence[int], observations: Sequence[Observation]) -> P
 
 def draws_table(seeds: Sequence[int], draws: Sequence[Mapping[str, Any]]) -> Table:
     """Tabulate the draws of several resets: range of numbers or set of words, and the values of the first reset."""
-    first_draws, rows = flat(draws[0]), []
+    first_draws, rows = flatten(draws[0]), []
     for name, span in spans(draws).items():
         values = [f"{leaf:.3g}" if isinstance(leaf, float) else str(leaf) for leaf in leaves(first_draws.get(name))]
         rows.append([name, span, " ".join(values)])
@@ -48,7 +48,7 @@ def spans(draws: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Return dotted name → range of the numbers, or set of the words, drawn under that name."""
     values_by_name: dict[str, list[Any]] = {}
     for draw in draws:
-        for name, value in flat(draw).items():
+        for name, value in flatten(draw).items():
             values_by_name.setdefault(name, []).extend(leaves(value))
     return {
         name: f"{min(values):.4g} … {max(values):.4g}"
@@ -84,7 +84,7 @@ def _plot(axes: Axes, frames: list[Array], action: Array, spec: Spec) -> None:
     places = step * (np.arange(len(action)) + 0.5)
     axes.barh(places, 0.5 * height * shares, 0.6 * step, left=left, color=GREEN, clip_on=False)
     for place, name, value, unit in zip(places, spec.action, action, spec.units, strict=True):
-        factor, label = readable(unit)
+        factor, label = display_unit(unit)
         number = factor * float(value)
         text = f"{round(number, 1) + 0.0:.1f} {label}" if label else f"{round(number, 4) + 0.0:.2g}"  # never "-0.0"
         axes.text(left - 0.55 * height, place, name, ha="right", va="center", fontsize=7)

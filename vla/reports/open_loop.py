@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 
 from vla.io.errors import counted
 from vla.io.files import write_json
-from vla.io.printable import readable
+from vla.io.printable import display_unit
 from vla.reports.pictures import BLUE, GREEN, GREY, MIDDLE, Panels, save
-from vla.reports.tables import Table, in_brackets
+from vla.reports.tables import Table, unit_suffix
 from vla.rollouts.open_loop import OpenLoop
 from vla.runs.files import ComponentError
 
@@ -56,7 +56,7 @@ def errors_table(errors: Sequence[ComponentError], episodes: int) -> Table:
     """Tabulate the errors over so many episodes with their intervals, in readable units."""
     rows = []
     for entry in errors:
-        factor, unit = readable(entry.unit)
+        factor, unit = display_unit(entry.unit)
         error, low, constant = (f"{factor * value:.3g}" for value in (entry.error, entry.ci_low, entry.constant))
         high = "∞" if entry.ci_high is None else f"{factor * entry.ci_high:.3g}"
         rows.append([entry.name, unit, error, f"{low}-{high}", constant])
@@ -72,7 +72,7 @@ def plot_errors(result: OpenLoop, path: Path) -> None:
     median_index = int(np.argsort(relative.mean(1))[len(result.seeds) // 2])
     panels: Panels = {"error, as a fraction of a constant action's": partial(_plot_relative, result=result)}
     for index, name in enumerate(result.spec.action):
-        title = name + in_brackets(result.spec.units[index])
+        title = name + unit_suffix(result.spec.units[index])
         panels[title] = partial(_plot_actions, result=result, episode=median_index, component=index)
     title = f"episode {result.seeds[median_index]}: recorded (grey) and predicted (blue) actions over time [s]"
     save(path, panels, 4, title=title, ink=MIDDLE)

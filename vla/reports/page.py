@@ -16,14 +16,16 @@ from vla.io.documents import read_bounded
 from vla.io.errors import UserError, counted
 from vla.io.files import write_text
 from vla.reports.tables import DIFFERENCE, Table, in_words
-from vla.rollouts.moving_picture import LARGEST
+from vla.rollouts.moving_picture import MAX_BYTES
 from vla.rollouts.results import Result
 
 WILSON = "Wilson's; those of several trainings account for correlation within trainings and within scenes"
-EXACT = "of McNemar's exact test on episodes with the same seeds, and of Fisher's on others, with Newcombe's intervals"
-EARLY = "by betting, valid at any time, where playing stopped once the result was clear, and otherwise"
+EXACT_TEST_NOTE = (
+    "of McNemar's exact test on episodes with the same seeds, and of Fisher's on others, with Newcombe's intervals"
+)
+EARLY_STOPPING_NOTE = "by betting, valid at any time, where playing stopped once the result was clear, and otherwise"
 RATES = "Rates have 95 % confidence intervals ({})."
-COMPARED = (
+COMPARISON_NOTE = (
     "p is {}; p Holm is adjusted for all comparisons in the table, so that "
     "at most 5 % of tables have a false difference. The verdict is better or worse if p Holm is at most 0.05, else not "
     "worse by N points if the interval, which is not adjusted, excludes a loss of N percentage points, else open."
@@ -61,13 +63,15 @@ def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bo
     environment.filters.update(embedded=_embedded, in_words=in_words, counted=counted)
     parts = [part for part in parts if part.rows]
     compares = any(isinstance(part, Table) and {*DIFFERENCE} <= {*part.heads} for part in parts)
-    notes = f"{RATES} {COMPARED}" if compares else RATES
+    notes = f"{RATES} {COMPARISON_NOTE}" if compares else RATES
     content = dict.fromkeys(("subtitle", "warning", "rate", "of"), "") | content
     text = environment.get_template("page.html").render(
         title=title,
         parts=parts,
         written=f"{datetime.now():%Y-%m-%d %H:%M}",
-        notes=notes.format(*(f"{EARLY} {note}" if anytime else note for note in (WILSON, EXACT))),
+        notes=notes.format(
+            *(f"{EARLY_STOPPING_NOTE} {note}" if anytime else note for note in (WILSON, EXACT_TEST_NOTE))
+        ),
         **content,
     )
     write_text(path, text)
@@ -76,7 +80,7 @@ def render(path: Path, title: str, parts: Sequence[Table | Section], anytime: bo
 
 def _embedded(picture: Path) -> str:
     """Return a picture as a data URL; raise a UserError for other files, which symbolic links could put into a page."""
-    content = read_bounded(picture, LARGEST)
+    content = read_bounded(picture, MAX_BYTES)
     if not content.startswith((b"RIFF", b"\x89PNG")):
         raise UserError(f"{picture} is no picture: remove it")
     return f"data:image/{picture.suffix[1:]};base64,{b64encode(content).decode()}"

@@ -10,7 +10,7 @@ from vla.reports.pictures import BLUE, RED, Panels, plot_rates, save
 from vla.reports.tables import DIFFERENCE, Table, difference, in_words, rate
 from vla.rollouts.comparison import SUCCESS, Comparison
 from vla.rollouts.motion import AMOUNTS
-from vla.rollouts.results import Counted, Report
+from vla.rollouts.results import EventRate, Report
 from vla.rollouts.sequential import LEVEL
 
 LEVELS = {"wide": BLUE, "hard": RED}  # end of a condition's name → colour
@@ -26,7 +26,7 @@ MOTION = (
 )
 
 
-def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Mapping[str, Comparison]]) -> Table:
+def conditions_table(reports: Mapping[str, Report], comparisons: Mapping[str, Mapping[str, Comparison]]) -> Table:
     """Tabulate success and its interval per condition, and its comparison with the first condition.
 
     Below a condition there is a row for each of its tasks, if it has several and the table stays short. Conditions that
@@ -38,24 +38,24 @@ def conditions_table(reports: Mapping[str, Report], compared: Mapping[str, Mappi
     rows = []
     for name, report in reports.items():
         if name not in equal:
-            rows.append([name, *cells(report.counted()), *difference(compared.get(name, {}).get(SUCCESS))])
+            rows.append([name, *cells(report.event_rate()), *difference(comparisons.get(name, {}).get(SUCCESS))])
             tasks = report.tasks if detailed and len(report.tasks) > 1 else {}
-            rows += [[f"  {task}", *cells(part.counted()), *difference(None)] for task, part in tasks.items()]
+            rows += [[f"  {task}", *cells(part.event_rate()), *difference(None)] for task, part in tasks.items()]
     note = f"the same as {first_name}, because they change nothing in the task: {', '.join(equal)}" if equal else ""
     heads = ("condition", "success [%]", "episodes", *DIFFERENCE)
     return Table(heads, rows, "Success under other conditions, on the same seeds", note, ("p",))
 
 
-def cells(found: Counted) -> list[str]:
+def cells(event_rate: EventRate) -> list[str]:
     """Return a rate with its interval, and the episodes, as cells."""
-    return [rate((found.rate, found.ci_low, found.ci_high)), f"{found.count}/{found.of}"]
+    return [rate((event_rate.rate, event_rate.ci_low, event_rate.ci_high)), f"{event_rate.count}/{event_rate.of}"]
 
 
 def secondary_table(
-    compared: Mapping[tuple[str, ...], Mapping[str, Comparison]], heads: Sequence[str] = ("condition",)
+    comparisons: Mapping[tuple[str, ...], Mapping[str, Comparison]], heads: Sequence[str] = ("condition",)
 ) -> Table:
     """Tabulate differences in milestones and motion, in a row per case that has any; `heads` name its columns."""
-    cases = {words: metrics for words, metrics in compared.items() if {*metrics} - {SUCCESS}}
+    cases = {words: metrics for words, metrics in comparisons.items() if {*metrics} - {SUCCESS}}
     unordered = {name for metrics in cases.values() for name in metrics} - {SUCCESS}
     names = [*(name for name in AMOUNTS if name in unordered), *sorted(unordered - {*AMOUNTS})]
     lines = [
@@ -82,7 +82,7 @@ def rate_tables(report: Report) -> list[Table]:
     rows = {kind: [[name, *cells(counted)] for name, counted in rates.items()] for kind, rates in report.rates.items()}
     if report.mean_over_tiers:
         rows["tiers"].append([report.mean_label, rate(report.mean_over_tiers), ""])
-    mean = "; on average {:.2f} ({:.2f}-{:.2f})".format(*report.mean_in_a_row) if report.mean_in_a_row else ""
+    mean = "; on average {:.2f} ({:.2f}-{:.2f})".format(*report.mean_completed) if report.mean_completed else ""
     motion = [[AMOUNTS[name], str(median), str(median.episodes)] for name, median in report.medians.items()]
     heads = ("rate [%]", "episodes")
     return [

@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 from urllib.parse import quote
 
-from vla.config.differences import at
-from vla.data.index import INDEX, listed, read_index
+from vla.config.differences import value_at
+from vla.data.index import INDEX, format_numbers, read_index
 from vla.io.errors import counted
 from vla.reports.factors import episode_panels
 from vla.reports.open_loop import errors_table
@@ -21,9 +21,9 @@ from vla.rollouts.results import ERROR, Report, Result
 from vla.runs.folder import EPISODES, ERRORS_PLOT, PAGE, RECORDING, RECORDINGS, SAMPLES, Run, read_run
 from vla.spec import IN_DISTRIBUTION
 
-NAMED, LISTED = 5, 20  # maximum number of tasks in a title, and of recordings
+MAX_TASKS, MAX_RECORDINGS = 5, 20  # maximum number of tasks in a title, and of recordings
 ROLLOUTS = "Failures first, of every outcome the first ones; each picture shows a whole episode in five seconds."
-PLAYED = (
+PLAYED_NOTE = (
     "Outcomes, lengths, and, where only some succeed, success over the factors that it depends on most, with 95 % "
     "intervals; failures are red."
 )
@@ -47,7 +47,7 @@ def write_page(folder: Path) -> Path:
         Section("", picture=folder / ERRORS_PLOT if run.errors else None),
         _rounds(run),
         _rollouts(run),
-        Section("Episodes", PLAYED, panels=svgs(episode_panels(report)) if report else {}),
+        Section("Episodes", PLAYED_NOTE, panels=svgs(episode_panels(report)) if report else {}),
         *([conditions_table(run.reports, compared)] if conditions else []),
         secondary_table({(name,): metrics for name, metrics in compared.items()}),
         *(rate_tables(report) if report else ()),
@@ -71,10 +71,10 @@ def write_page(folder: Path) -> Path:
 
 def _tasks(run: Run) -> str:
     """Return the names of the evaluated tasks, or how many there are; without any, the goal's or task's class."""
-    classes = (str(at(run.config, key, "")).rpartition(".")[2] for key in ("task.goal._target_", "task._target_"))
+    classes = (str(value_at(run.config, key, "")).rpartition(".")[2] for key in ("task.goal._target_", "task._target_"))
     words = (re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower() for name in classes)
     tasks = [in_words(task) for task in run.tasks] or [*filter(None, words)][:1]
-    return ", ".join(tasks) if len(tasks) <= NAMED else f"{len(tasks)} tasks"
+    return ", ".join(tasks) if len(tasks) <= MAX_TASKS else f"{len(tasks)} tasks"
 
 
 def _warning(run: Run) -> str:
@@ -105,11 +105,11 @@ def _facts(run: Run) -> dict[str, str]:
     if training:
         facts["training"] = f"{counted(training.steps, 'step')} in {duration(training.seconds)}"
         keys = {"demonstrations": "collect.episodes", "and those in": "collect.more", "from weights of": "pretrained"}
-        values = {name: at(run.config, key, None) for name, key in keys.items()}
+        values = {name: value_at(run.config, key, None) for name, key in keys.items()}
         facts |= {name: config_value(value) for name, value in values.items() if value is not None}
     if report and report.seeds:
         seeds = counted(len(report.seeds), "seed" if run.report else "held-out episode")
-        facts["evaluated on"] = f"{seeds}: {listed(report.seeds)}"
+        facts["evaluated on"] = f"{seeds}: {format_numbers(report.seeds)}"
     if report and report.checkpoint:
         facts["checkpoint"] = str(_path(Path(report.checkpoint), run.folder))
     return facts
@@ -119,15 +119,15 @@ def _rounds(run: Run) -> Table:
     """Tabulate the rounds with the expert that have a page, success before each, and the evaluation after them."""
     rows = []
     for page in sorted(run.folder.glob(f"round_*/{PAGE}"), key=lambda path: (len(path.parent.name), path)):
-        entries, _ = read_index(page.parent / EPISODES / INDEX, any_seed=False, damaged=False)
-        report = Report(tuple(Result(entry.seed, entry.outcome) for entry in entries if entry.stored))
+        entries, _ = read_index(page.parent / EPISODES / INDEX, any_seed=False, allow_damage=False)
+        report = Report(tuple(Result(entry.seed, entry.outcome) for entry in entries if entry.is_stored))
         name, subrun = page.parent.name, read_run(page.parent)
         link = links({in_words(name): f"{quote(name)}/{PAGE}"})
         validation = percent(curve[1][-1]) if (curve := subrun.metrics.get("val/success")) else ""
         length = (str(subrun.training.steps), duration(subrun.training.seconds)) if subrun.training else ("", "")
-        rows.append([link, *(cells(report.counted()) if report.results else ("", "")), validation, *length])
+        rows.append([link, *(cells(report.event_rate()) if report.results else ("", "")), validation, *length])
     if rows and run.report:
-        rows.append(["evaluation", *cells(run.reports[IN_DISTRIBUTION].counted()), "", "", ""])
+        rows.append(["evaluation", *cells(run.reports[IN_DISTRIBUTION].event_rate()), "", "", ""])
     heads = ("round", "success before it [%]", "episodes", "in validation after it [%]", "steps", "training")
     return Table(heads, rows, "Rounds with the expert", ROUNDS)
 
@@ -144,13 +144,15 @@ def _rollouts(run: Run) -> Section:
             if (group := [result for result in results if result.success == good])
         ]
         facts["recording"] = links({RECORDING: RECORDING}) + f" has {' and '.join(counts)}; rerun {RECORDING} plays it"
-        policy = f"agent={at(run.config, 'chosen.agent')}"
+        policy = f"agent={value_at(run.config, 'chosen.agent')}"
         policy = f"checkpoint={_path(Path(run.report.checkpoint))}" if run.report.checkpoint else policy
         command = f"python -m vla.run {policy} evaluate.seed=SEED evaluate.episodes=1 evaluate.recordings=all"
         facts["record another"] = command if run.training else f"{command}, and the task's options of the command below"
     if names := sorted(file.name for file in (run.folder / RECORDINGS).glob("*.rrd")):
-        rest = f" and {len(names) - LISTED} more in {RECORDINGS}" if len(names) > LISTED else ""
-        facts["single recordings"] = links({name: f"{RECORDINGS}/{quote(name)}" for name in names[:LISTED]}) + rest
+        rest = f" and {len(names) - MAX_RECORDINGS} more in {RECORDINGS}" if len(names) > MAX_RECORDINGS else ""
+        facts["single recordings"] = (
+            links({name: f"{RECORDINGS}/{quote(name)}" for name in names[:MAX_RECORDINGS]}) + rest
+        )
     return Section("Rollouts", ROLLOUTS, facts, rollouts=moving_pictures(results, run.folder / RECORDINGS))
 
 

@@ -66,13 +66,15 @@ def percent(share: float) -> str:
     return f"{100 * share:.1f}"
 
 
-def difference(found: Comparison | None) -> list[str]:
+def difference(comparison: Comparison | None) -> list[str]:
     """Return a difference in success as the cells of `DIFFERENCE`; empty ones without a comparison."""
-    if found is None:
+    if comparison is None:
         return [""] * len(DIFFERENCE)
-    middle, low, high = (f"{100 * share:+.1f}" for share in (found.difference, found.ci_low, found.ci_high))
-    p_holm = "" if found.p_holm is None else f"{found.p_holm:.2g}"
-    return [f"{middle} ({low} to {high})", f"{found.p:.2g}", p_holm, found.verdict]
+    middle, low, high = (
+        f"{100 * share:+.1f}" for share in (comparison.difference, comparison.ci_low, comparison.ci_high)
+    )
+    p_holm = "" if comparison.p_holm is None else f"{comparison.p_holm:.2g}"
+    return [f"{middle} ({low} to {high})", f"{comparison.p:.2g}", p_holm, comparison.verdict]
 
 
 def links(addresses: Mapping[str, str]) -> Markup:
@@ -92,7 +94,7 @@ def in_words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def in_brackets(unit: str) -> str:
+def unit_suffix(unit: str) -> str:
     """Format a unit for the title of a plot, as " [m]"; "" for none."""
     return "" if unit == "1" else f" [{unit}]"
 

@@ -119,8 +119,8 @@ class CartesianController:
         self._command(self.joints + np.minimum(np.maximum(solution - self.joints, -reach), reach))
         return self.joints
 
-    def motion_between(self, before: Array, after: Array) -> Array:
+    def motion_between(self, joints_before: Array, joints_after: Array) -> Array:
         """Return the (6,) translation [m] and rotation vector [rad] of the tool between joints (J,) [rad]."""
-        start, end = self.arm.forward(before)[0], self.arm.forward(after)[0]
+        start, end = self.arm.forward(joints_before)[0], self.arm.forward(joints_after)[0]
         turn = vector_from_rotation(end[:3, :3] @ start[:3, :3].T)
         return np.concatenate([end[:3, 3] - start[:3, 3], turn])

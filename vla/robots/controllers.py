@@ -35,10 +35,10 @@ class JointController:
         """Return the targets (J,) [rad]."""
         return motion[self._order] * self._factors
 
-    def motion_between(self, before: Array, after: Array) -> Array:
-        """Return the joints `after` (J,) in the order and units of the action."""
-        motion = np.empty(len(after))
-        motion[self._order] = after / self._factors
+    def motion_between(self, joints_before: Array, joints_after: Array) -> Array:
+        """Return `joints_after` (J,) in the order and units of the action."""
+        motion = np.empty(len(joints_after))
+        motion[self._order] = joints_after / self._factors
         return motion
 
 

@@ -38,15 +38,15 @@ class Summary:
     episodes: int  # stored
     successes: int  # of the tried seeds
     added: int  # episodes that this call stored
-    tried: int  # seeds of known outcome, that is, without the episodes lost in a repair
+    attempts: int  # seeds of known outcome, that is, without the episodes lost in a repair
     failures: dict[str, int]  # outcome → seeds
     tasks: dict[str, tuple[int, int]]  # task → successes, seeds tried
     seconds: float  # of this call
 
     @classmethod
-    def of(cls, store: EpisodeStore, added: int, seconds: float) -> Summary:
+    def from_store(cls, store: EpisodeStore, added: int, seconds: float) -> Summary:
         """Summarise a store."""
-        tried = [entry for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED)]
+        tried = [entry for entry in store.attempts if entry.outcome not in (DAMAGED, NOT_NEEDED)]
         failures = Counter(entry.outcome for entry in tried if not entry.success)
         solved, tries = Counter(entry.task for entry in tried if entry.success), Counter(entry.task for entry in tried)
         tasks = {task: (solved[task], tries[task]) for task in sorted(tries)}
@@ -55,7 +55,7 @@ class Summary:
     @property
     def success_rate(self) -> float:
         """Share of the tried seeds that the expert solved, 0…1."""
-        return self.successes / self.tried if self.tried else 0.0
+        return self.successes / self.attempts if self.attempts else 0.0
 
 
 def collect(
@@ -85,18 +85,18 @@ def collect(
             if initial_count < episodes:
                 make = partial(DemonstrationWorker, make_environment, make_expert, keep_failures)
                 _fill_with(cluster, make, store, partial(_fill, store, episodes, seed, multitask, keep_failures))
-    return Summary.of(store, len(store.episodes) - initial_count, time.monotonic() - start)
+    return Summary.from_store(store, len(store.episodes) - initial_count, time.monotonic() - start)
 
 
 def _fill_with(cluster: Cluster, make: WorkerFactory, store: EpisodeStore, fill: Callable[[Pool], None]) -> None:
     """Fill the store, restarting workers that died: in long collections processes occasionally crash outside Python."""
     while True:
-        attempts = len(store.tried)
+        attempts = len(store.attempts)
         try:
             with cluster.pool(make) as pool:
                 return fill(pool)
         except WorkersLost as lost:
-            if len(store.tried) == attempts:
+            if len(store.attempts) == attempts:
                 raise WorkersLost(f"{lost}; committed episodes are safe, run again to continue") from lost
             log.warning("workers were lost after %s; continuing with new ones", counted(len(store.episodes), "episode"))
 
@@ -107,22 +107,22 @@ class _Attempts:
     They are rolled out in advance for tasks that would need more even if all pending episodes succeed.
     """
 
-    def __init__(self, pool: Pool, multitask: Multitask | None, store: EpisodeStore, first: int) -> None:
-        """Continue a store, or begin it at the seed `first`; without `multitask` all seeds are of one task."""
+    def __init__(self, pool: Pool, multitask: Multitask | None, store: EpisodeStore, first_seed: int) -> None:
+        """Continue a store, or begin it at the seed `first_seed`; without `multitask` all seeds are of one task."""
         self._pool = pool
         self._task_of = multitask.task_of if multitask else lambda seed: ""
         self._successes = dict.fromkeys(multitask.tasks if multitask else [""], 0)
         for entry in store.episodes:
             self._successes[self._task_of(entry.seed)] += entry.success
-        self._next_seed = first if store.next_seed is None else store.next_seed
+        self._next_seed = first_seed if store.next_seed is None else store.next_seed
         self._pending: deque[tuple[int, Future | None]] = deque()
 
-    def next(self, most: int) -> Episode:
-        """Return the episode of the next seed, while at most `most` others are rolled out.
+    def next(self, max_pending: int) -> Episode:
+        """Return the episode of the next seed, while at most `max_pending` others are rolled out.
 
         Its outcome is `NOT_NEEDED` if its task is ahead of another one.
         """
-        self._advance(most)
+        self._advance(max_pending)
         seed, future = self._pending.popleft()
         task = self._task_of(seed)
         if not _is_needed(task, self._successes):
@@ -131,11 +131,11 @@ class _Attempts:
         self._successes[task] += episode.success
         return episode
 
-    def _advance(self, most: int) -> None:
+    def _advance(self, max_pending: int) -> None:
         seeds = [seed for seed, future in self._pending if future is not None]
         expected = Counter(self._successes) + Counter(self._task_of(seed) for seed in seeds)
         expected = {task: expected[task] for task in self._successes}
-        missing = most - len(seeds)
+        missing = max_pending - len(seeds)
         while missing > 0:
             if self._next_seed >= FIRST_SEED:
                 raise UserError(f"seeds from {FIRST_SEED} on are reserved for evaluation: lower collect.seed")
@@ -156,7 +156,7 @@ def _fill(
 ) -> None:
     """Append episodes until the store has `episodes`; raise a UserError if the expert fails too often in a row."""
     initial_count, attempts, start = len(store.episodes), _Attempts(pool, multitask, store, seed), time.monotonic()
-    outcomes = Counter(entry.success for entry in store.tried if entry.outcome not in (DAMAGED, NOT_NEEDED))
+    outcomes = Counter(entry.success for entry in store.attempts if entry.outcome not in (DAMAGED, NOT_NEEDED))
     in_a_row = defaultdict[str, list[str]](list)  # task → outcomes of the failures since its last success
     with Bar("collecting", episodes, initial_count) as bar:
         while (stored := len(store.episodes)) < episodes:
@@ -206,7 +206,7 @@ class DemonstrationWorker:
             complete = all(observation.rgb for observation in episode.observations)
             with self._environment.blind() if complete else nullcontext():
                 result = replay(self._environment, episode)
-            if result.differs is not None:
+            if result.first_difference is not None:
                 episode.outcome = NOT_REPEATABLE
             elif not complete:
                 episode.observations = result.observations

@@ -20,7 +20,7 @@ from vla.spec import Array
 
 Key = TypeVar("Key")
 Amounts = Sequence[float] | Array
-Together = Sequence[tuple[Result, Result]]  # of two policies, or of one under two conditions, in the same episodes
+ResultPairs = Sequence[tuple[Result, Result]]  # of two policies, or of one under two conditions, in the same episodes
 
 SUCCESS = "success"  # what is compared first; the others are fields of `Motion`, and milestones
 
@@ -45,7 +45,7 @@ class Comparison:
     episodes: int  # number of pairs; without pairs, of all episodes
     only_first: int | None = None  # pairs in which only the first succeeded, or had more; None without pairs
     only_second: int | None = None
-    p_holm: float | None = None  # adjusted for all comparisons made together, see `concluded`
+    p_holm: float | None = None  # adjusted for all comparisons made together, see `conclude_cases`
     verdict: str = ""
 
     def conclude(self, p_holm: float, margin: float | None) -> Comparison:
@@ -80,14 +80,14 @@ def compare_pairs(pairs: Pairs, anytime: bool = False) -> Comparison:
     return Comparison((second - first) / max(episodes, 1), low, high, p, episodes, first, second)
 
 
-def compare_samples(won_first: float, first: float, won_second: float, second: float) -> Comparison:
+def compare_samples(first_successes: float, first: float, second_successes: float, second: float) -> Comparison:
     """Compare success in different episodes, `first` and `second` of them: Fisher's exact test, Newcombe's interval.
 
     Effective numbers of episodes need not be whole; the test rounds them.
     """
-    low, high = newcombe(won_first, first, won_second, second)
-    p = fisher(*(round(number) for number in (won_first, first, won_second, second)))
-    return Comparison(won_second / second - won_first / first, low, high, p, round(first + second))
+    low, high = newcombe(first_successes, first, second_successes, second)
+    p = fisher(*(round(number) for number in (first_successes, first, second_successes, second)))
+    return Comparison(second_successes / second - first_successes / first, low, high, p, round(first + second))
 
 
 def compare_amounts(first: Amounts, second: Amounts, anytime: bool = False) -> Comparison | None:
@@ -105,22 +105,25 @@ def compare_amounts(first: Amounts, second: Amounts, anytime: bool = False) -> C
     return Comparison(float(np.median(differences)), *interval, p, len(differences), decreases, increases)
 
 
-def fisher(won_first: int, first: int, won_second: int, second: int) -> float:
+def fisher(first_successes: int, first: int, second_successes: int, second: int) -> float:
     """Return the two-sided p-value of Fisher's exact test for equal success rates: twice that of the smaller tail."""
     from scipy.stats import hypergeom  # the import takes a second
 
-    distribution = hypergeom(first + second, won_first + won_second, second)
-    return float(min(1.0, 2 * distribution.cdf(won_second), 2 * distribution.sf(won_second - 1)))
+    distribution = hypergeom(first + second, first_successes + second_successes, second)
+    return float(min(1.0, 2 * distribution.cdf(second_successes), 2 * distribution.sf(second_successes - 1)))
 
 
-def newcombe(won_first: float, first: float, won_second: float, second: float) -> tuple[float, float]:
+def newcombe(first_successes: float, first: float, second_successes: float, second: float) -> tuple[float, float]:
     """Return the 95 % confidence interval of the second rate minus the first, for independent samples.
 
     R. G. Newcombe, "Interval estimation for the difference between independent proportions: comparison of eleven
     methods", Statistics in Medicine 17 (1998), 873-890, method 10: it combines Wilson's intervals of both rates.
     """
-    (low_one, high_one), (low_two, high_two) = wilson_interval(won_first, first), wilson_interval(won_second, second)
-    one, two = won_first / first, won_second / second
+    (low_one, high_one), (low_two, high_two) = (
+        wilson_interval(first_successes, first),
+        wilson_interval(second_successes, second),
+    )
+    one, two = first_successes / first, second_successes / second
     return two - one - hypot(two - low_two, high_one - one), two - one + hypot(high_two - two, one - low_one)
 
 
@@ -148,26 +151,26 @@ def newcombe_paired(pairs: Pairs) -> tuple[float, float]:
 
 
 def pairs_of(
-    together: Iterable[tuple[Result, Result]], happened: Callable[[Result], bool] = attrgetter("success")
+    pairs: Iterable[tuple[Result, Result]], happened: Callable[[Result], bool] = attrgetter("success")
 ) -> Pairs:
     """Count in which episodes of each pair an event happened, without pairs in which one was not completed."""
-    counts = Counter((happened(one), happened(two)) for one, two in together if ERROR not in (one.outcome, two.outcome))
+    counts = Counter((happened(one), happened(two)) for one, two in pairs if ERROR not in (one.outcome, two.outcome))
     return Pairs(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
 
 
-def compared_in(together: Together, anytime: bool) -> dict[str, Comparison]:
+def compare_results(results: ResultPairs, anytime: bool) -> dict[str, Comparison]:
     """Compare pairs of episodes in success, in motion where both succeeded, and in milestones of the same task.
 
     Returns `SUCCESS`, field of `Motion` or milestone → comparison, without fields that too few pairs have.
     """
-    comparisons = {SUCCESS: compare_pairs(pairs_of(together), anytime)}
-    motions = [(one.motion, two.motion) for one, two in together if one.success and two.success]
+    comparisons = {SUCCESS: compare_pairs(pairs_of(results), anytime)}
+    motions = [(one.motion, two.motion) for one, two in results if one.success and two.success]
     for name in AMOUNTS:
         pairs = [(getattr(one, name, None), getattr(two, name, None)) for one, two in motions]
         amounts = np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
         if comparison := compare_amounts(amounts[:, 0], amounts[:, 1], anytime):
             comparisons[name] = comparison
-    alike = [(one, two) for one, two in together if one.task == two.task]  # another task may not have the milestone
+    alike = [(one, two) for one, two in results if one.task == two.task]  # another task may not have the milestone
     for name in sorted({name for pair in alike for result in pair for name in result.milestones}):
         comparisons[name] = compare_pairs(pairs_of(alike, lambda result, name=name: name in result.milestones), anytime)
     return comparisons
@@ -186,11 +189,13 @@ def compare_conditions(reports: Mapping[str, Report], margin: float) -> dict[str
         uneven = len(first.results) != len(other.results) and not anytime
         if uneven or any(one.seed != two.seed for one, two in together):
             raise UserError("only reports on the same seeds can be compared")
-        comparisons[name] = compared_in(together, anytime)
-    return concluded(comparisons, margin)
+        comparisons[name] = compare_results(together, anytime)
+    return conclude_cases(comparisons, margin)
 
 
-def concluded(cases: Mapping[Key, Mapping[str, Comparison]], margin: float | None) -> dict[Key, dict[str, Comparison]]:
+def conclude_cases(
+    cases: Mapping[Key, Mapping[str, Comparison]], margin: float | None
+) -> dict[Key, dict[str, Comparison]]:
     """Return the comparisons of all cases with verdicts, adjusted within two families: success, and all other metrics.
 
     The family-wise error rate of each is at most 5 %: S. Holm, "A simple sequentially rejective multiple test

@@ -16,12 +16,12 @@ from pathlib import Path
 
 from vla.io.errors import counted
 from vla.io.progress import Bar
-from vla.parallel.pool import THIS_PROCESS, Cluster, Crashed, Future, Pool
+from vla.parallel.pool import THIS_PROCESS, Cluster, Future, Pool, WorkerCrash
 from vla.rollouts.motion import motion_of
-from vla.rollouts.recordings import Recordings, chosen
+from vla.rollouts.recordings import Recordings, choose_results
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, close_agent
-from vla.rollouts.worlds import Stage, in_lanes, play
+from vla.rollouts.worlds import Stage, as_agents, play
 from vla.spec import Agent, Agents, Environment, Episode, Recorder
 
 log = logging.getLogger(__name__)
@@ -41,8 +41,8 @@ def evaluate(
     until: Callable[[Report], bool] | None = None,
     recordings: Recordings = "all",
     turns: int = 1,
-    known: Mapping[int, Result] | None = None,
-    keep: Callable[[Result], None] | None = None,
+    known_results: Mapping[int, Result] | None = None,
+    on_result: Callable[[Result], None] | None = None,
     lanes: int = 1,
 ) -> Report:
     """Play the episodes of the seeds; `name` is the label of the progress bar.
@@ -55,15 +55,17 @@ def evaluate(
     `turns`, the number of tasks if seeds cycle through tasks. Results of later seeds are discarded, so that the report
     does not depend on the number of workers.
 
-    Episodes whose seeds are in `known`, seed → result, are not played again. `keep` is called with every new result but
-    errors. Raises a UserError if the cluster raises one.
+    Episodes whose seeds are in `known_results`, seed → result, are not played again. `on_result` is called with every
+    new result but errors. Raises a UserError if the cluster raises one.
     """
     make = partial(_RolloutWorker, make_environment, make_agent, None if recordings == 0 else make_recorder, lanes)
-    record_all, score = recordings == "all", _Score(seeds, dict(known or {}), until, turns)
+    record_all, score = recordings == "all", _Score(seeds, dict(known_results or {}), until, turns)
     with cluster.pool(make) as pool:
-        _play_missing(pool, score, record_all, 1 if lanes == 1 else ROUNDS * lanes, name, keep or (lambda result: None))
+        _play_missing(
+            pool, score, record_all, 1 if lanes == 1 else ROUNDS * lanes, name, on_result or (lambda result: None)
+        )
         report = score.report()
-        if make_recorder is not None and not record_all and (results := chosen(report, recordings)):
+        if make_recorder is not None and not record_all and (results := choose_results(report, recordings)):
             _record(pool, results)
     return report
 
@@ -139,7 +141,7 @@ def _results(future: Future, seeds: Sequence[int]) -> list[Result]:
     """Return the results of a group of episodes; after a crash none, or an error result if the group is one episode."""
     try:
         return future.result()
-    except Crashed as crash:
+    except WorkerCrash as crash:
         return [Result(seeds[0], ERROR, error=str(crash))] if len(seeds) == 1 else []
 
 
@@ -161,27 +163,27 @@ def _record(pool: Pool, results: Sequence[Result]) -> None:
 
 def play_episode(environment: Environment, agent: Agent, seed: int) -> Result:
     """Play one episode; errors become results, so that one seed ends neither an evaluation nor a training."""
-    ((_, result),) = play([Stage(environment)], in_lanes(agent), [seed], all_images=False)
+    ((_, result),) = play([Stage(environment)], as_agents(agent), [seed], all_images=False)
     return result_of(seed, result, environment.spec.control_hz)
 
 
-def result_of(seed: int, ended: Episode | Exception, control_hz: float) -> Result:
+def result_of(seed: int, ending: Episode | Exception, control_hz: float) -> Result:
     """Summarise the episode, or the error, that `play` yields for a seed; `control_hz` is the steps per second."""
     try:
-        if isinstance(ended, Exception):
-            raise ended
+        if isinstance(ending, Exception):
+            raise ending
         # Worlds may give arrays; plain values support comparison and JSON.
-        motion = motion_of(ended, control_hz)
-        facts = [ended.draws, ended.completed, asdict(motion)]
+        motion = motion_of(ending, control_hz)
+        facts = [ending.draws, ending.completed, asdict(motion)]
         draws, completed, _ = json.loads(json.dumps(facts, default=lambda value: value.tolist(), allow_nan=False))
         return Result(
             seed,
-            ended.outcome,
-            ended.instruction,
-            len(ended.observations),
+            ending.outcome,
+            ending.instruction,
+            len(ending.observations),
             draws,
-            ended.task,
-            tuple(sorted(ended.milestones)),
+            ending.task,
+            tuple(sorted(ending.milestones)),
             completed=completed and tuple(completed),
             motion=motion,
         )
@@ -227,7 +229,7 @@ class _RolloutWorker:
         seeds, recorded = item
         recorders = self._recorders if recorded else [None] * len(self._recorders)
         stages = [Stage(*pair) for pair in zip(self._environments, recorders, strict=True)]
-        results = play(stages, in_lanes(self._agent), seeds, all_images=recorded)
+        results = play(stages, as_agents(self._agent), seeds, all_images=recorded)
         return [result_of(seed, result, self._environments[0].spec.control_hz) for seed, result in results]
 
     def close(self) -> None:

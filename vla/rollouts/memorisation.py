@@ -20,12 +20,12 @@ GREY = 128
 STRIDE = 4  # of the pixels that are compared
 
 
-class WithoutModality:
+class AgentWithoutModality:
     """An agent whose images are grey and without depth, or whose instruction is empty, or both."""
 
-    def __init__(self, agent: Agent, missing: Modality) -> None:
+    def __init__(self, agent: Agent, modality: Modality) -> None:
         """Hide a modality from an agent."""
-        self._agent, self._missing = agent, missing
+        self._agent, self._missing = agent, modality
         self.info: dict[str, Any] = {}
 
     def reset(self, instruction: str, seed: int) -> None:
@@ -49,9 +49,9 @@ class WithoutModality:
         close_agent(self._agent)
 
 
-def make_without(make_agent: AgentFactory, missing: Modality, environment: Environment) -> WithoutModality:
+def make_agent_without(make_agent: AgentFactory, modality: Modality, environment: Environment) -> AgentWithoutModality:
     """Build an agent without a modality for an environment."""
-    return WithoutModality(make_agent(environment), missing)
+    return AgentWithoutModality(make_agent(environment), modality)
 
 
 class NearestDemonstration:

@@ -13,7 +13,7 @@ from vla.spec import Episode, Observation
 FRAMES, HEIGHT = 48, 160  # at most; the height of a frame in pixels
 MILLISECONDS, LAST_MILLISECONDS = 100, 1000  # of a frame, and of the last one
 QUALITY, EFFORT = 60, 2  # of the compression
-LARGEST = 4 << 20  # [bytes] of a file
+MAX_BYTES = 4 << 20  # [bytes] of a file
 
 
 def save_moving_picture(episode: Episode, path: Path) -> None:

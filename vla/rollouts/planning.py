@@ -13,22 +13,22 @@ from vla.rollouts.sequential import LEVEL
 from vla.rollouts.statistics import NORMAL_QUANTILE
 from vla.spec import Array
 
-MOST = 200_000  # episodes
-FAR = 9.0  # standard deviations beyond which outcomes are too rare to count
+MAX_EPISODES = 200_000  # episodes
+MAX_DEVIATION = 9.0  # standard deviations beyond which outcomes are too rare to count
 HORIZON = 4  # largest length of an evaluation with early stopping, as a multiple of the fixed number of episodes
 
 
-def episodes_needed(power: Callable[[int], float], enough: float) -> int | None:
-    """Return the number of episodes at which `power` reaches `enough`; None if it is more than `MOST`.
+def episodes_needed(power: Callable[[int], float], target: float) -> int | None:
+    """Return the number of episodes at which `power` reaches `target`; None if it is more than `MAX_EPISODES`.
 
     As outcomes are discrete, power may fall below it again by a little for a few larger numbers.
     """
     high = 1
-    while power(high) < enough:
-        if high == MOST:
+    while power(high) < target:
+        if high == MAX_EPISODES:
             return None
-        high = min(2 * high, MOST)
-    return bisect_left(range(high), enough, high // 2 + 1, key=power)
+        high = min(2 * high, MAX_EPISODES)
+    return bisect_left(range(high), target, high // 2 + 1, key=power)
 
 
 def power_for_bar(episodes: int, rate: float, bar: float) -> float:
@@ -48,7 +48,7 @@ def power_of_pairs(episodes: int, discordant: float, difference: float) -> float
     """
     from scipy.stats import binom
 
-    mean, spread = episodes * discordant, FAR * sqrt(episodes * discordant) + FAR
+    mean, spread = episodes * discordant, MAX_DEVIATION * sqrt(episodes * discordant) + MAX_DEVIATION
     counts = np.arange(max(0, int(mean - spread)), min(episodes, int(mean + spread)) + 1)
     limits = binom.ppf(LEVEL / 2, counts, 0.5)
     limits -= binom.cdf(limits, counts, 0.5) > LEVEL / 2  # the largest number lost that is significant
@@ -64,7 +64,7 @@ def power_of_samples(episodes: int, one: float, other: float) -> float:
     counts = np.arange(episodes + 1)
     ways = binom.logpmf(counts, episodes, 0.5)  # and a constant, which cancels
     first, second = (binom.pmf(counts, episodes, rate) for rate in (one, other))
-    reach = FAR * sqrt(episodes * max(one * (1 - one), other * (1 - other))) + FAR
+    reach = MAX_DEVIATION * sqrt(episodes * max(one * (1 - one), other * (1 - other))) + MAX_DEVIATION
     low, high = max(0, int(episodes * one - reach)), min(episodes, int(episodes * other + reach))
     power = 0.0
     for total in range(2 * low, 2 * high + 1):
@@ -79,17 +79,17 @@ def power_of_samples(episodes: int, one: float, other: float) -> float:
 class Stopping:
     """Numbers of episodes of evaluations that stop as soon as they are decided."""
 
-    most: int  # number of episodes after which the share `enough` of the evaluations is decided
-    mean: float  # mean number of episodes if evaluations end after `most`
-    wrong: float  # type I error: share of the evaluations that are decided although there is no difference
+    max_episodes: int  # number of episodes after which the target share of the evaluations is decided
+    mean: float  # mean number of episodes if evaluations end after `max_episodes`
+    type_1_error: float  # type I error: share of the evaluations that are decided although there is no difference
 
 
-def stopping(mean: float, one: float, zero: float, enough: float, fixed: int) -> Stopping | None:
+def stopping(mean: float, one: float, zero: float, target: float, fixed: int) -> Stopping | None:
     """Return how long evaluations take that stop as soon as their observations, 0 or 1, exclude a `mean`.
 
     For one policy every episode is an observation, and `mean` is the bar; for two, every pair of episodes in which
     exactly one policy succeeds, and `mean` is 1/2. An episode gives a 1 and a 0 with the probabilities `one` and
-    `zero`. The share `enough` of the evaluations is to be decided, which takes `fixed` episodes without early stopping.
+    `zero`. The share `target` of the evaluations is to be decided, which takes `fixed` episodes without early stopping.
     Returns None if a smaller share is decided after `HORIZON` times as many.
     """
     from scipy.stats import binom
@@ -103,10 +103,10 @@ def stopping(mean: float, one: float, zero: float, enough: float, fixed: int) ->
         """Return the share of evaluations in which the observations of so many episodes decide."""
         return float(ends @ binom.sf(counts - 1, episodes, rate))
 
-    most = episodes_needed(lambda episodes: decided(ends, episodes), enough) if ends.sum() > enough else None
+    most = episodes_needed(lambda episodes: decided(ends, episodes), target) if ends.sum() > target else None
     if most is None:
         return None
-    # Wald: of the episodes until the m-th observation, or `most`, the share `rate` are observations.
+    # Wald: of the episodes until the m-th observation, or `max_episodes`, the share `rate` are observations.
     waits = np.cumsum(binom.sf(counts - 1, most, rate)) / rate
     return Stopping(most, float(ends @ waits + (1 - ends.sum()) * most), decided(chance_ends, most))
 

@@ -19,7 +19,7 @@ import numpy as np
 from vla.io.types import NonNegative, Rate
 from vla.rollouts.rollout import AgentFactory, close_agent
 from vla.schedule import Delays, Schedule
-from vla.spec import Agent, Array, Environment, Observation, Running, Spec
+from vla.spec import Agent, Array, Environment, Observation, RunningPlan, Spec
 
 Plan = Callable[[Observation], Array]  # returns a chunk (k, D)
 
@@ -32,7 +32,7 @@ class Network:
         latency: shortest time from an observation to its actions, inference included [s].
         jitter: largest addition to it, uniformly distributed [s].
         loss: probability that an observation or its answer is lost; the next one is sent after the longest time.
-        ensemble: m in the weights of the mean over all chunks for a step, see `averaged`; None: only the newest counts.
+        ensemble: m in the weights of the mean over all chunks for a step, see `weighted_mean`; None: the newest counts.
     """
 
     latency: NonNegative
@@ -71,7 +71,7 @@ class RealTime:
         """Start an episode, once the policy is idle."""
         self._link.reset(seed)
         self._schedule, self._step, self._sent_step = Schedule[Array](), 0, 0
-        self._answer: Delayed | Future[Array] | None = None
+        self._answer: DelayedChunk | Future[Array] | None = None
         self._last_action: Array | None = None
 
     def act(self, observation: Observation) -> Array:
@@ -83,19 +83,19 @@ class RealTime:
         if self._answer is None and self._schedule.wants_plan(self._step, execute):
             self._answer, self._sent_step = self._link.send(self._with_plan(observation), first), self._step
             self._take(wait=first)
-        if actions := self._schedule.at(self._step):
+        if actions := self._schedule.actions_at(self._step):
             self._step += 1  # only now: while the arm holds, no action becomes obsolete
-            self._last_action = actions[-1] if self._ensemble is None else averaged(actions, self._ensemble)
+            self._last_action = actions[-1] if self._ensemble is None else weighted_mean(actions, self._ensemble)
             return self._last_action
         assert self._last_action is not None, "the first answer has actions"
         return np.where(self._relative, 0, self._last_action).astype(np.float32)
 
     def _with_plan(self, observation: Observation) -> Observation:
         """Return the observation with the rest of the plan that is executed until the next one arrives."""
-        rest = self._schedule.remaining(self._step)
+        rest = self._schedule.remaining_actions(self._step)
         if not rest or self._ensemble is not None:
             return observation
-        return replace(observation, running=Running(np.stack(rest), min(self._link.delays.longest, len(rest))))
+        return replace(observation, running=RunningPlan(np.stack(rest), min(self._link.delays.forecast, len(rest))))
 
     def _take(self, wait: bool = False) -> None:
         if self._answer is not None and (wait or self._answer.done()):
@@ -104,7 +104,7 @@ class RealTime:
                 self._schedule.add(list(actions), self._sent_step)
 
 
-def averaged(actions: Sequence[Array], ensemble: float) -> Array:
+def weighted_mean(actions: Sequence[Array], ensemble: float) -> Array:
     """Return the mean of actions (D,) with weights exp(-m i), m = `ensemble`, i = 0 for the first, the oldest.
 
     Source: Zhao et al., Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware, arXiv 2304.13705,
@@ -132,27 +132,29 @@ class SimulatedLink:
         """Begin a control step."""
         self.now += 1
 
-    def send(self, observation: Observation, first: bool) -> Delayed:
-        """Compute the chunk, and draw when it arrives; the `first` one is never lost."""
+    def send(self, observation: Observation, is_first: bool) -> DelayedChunk:
+        """Compute the chunk, and draw when it arrives; if it `is_first`, it is never lost."""
         network, (share, draw) = self._network, self._random.random(2)
         lost = draw < network.loss
         seconds = network.latency + network.jitter * (1.0 if lost else share)
         steps = math.ceil(seconds * self._hz - 1e-9)
         actions = self._plan(observation)  # even if it is lost, which happens on the way back
-        return Delayed(self, self.now + (max(steps, 1) if lost else steps), None if lost and not first else actions)
+        return DelayedChunk(
+            self, self.now + (max(steps, 1) if lost else steps), None if lost and not is_first else actions
+        )
 
 
 @dataclass(frozen=True)
-class Delayed:
-    """A chunk that arrives at the step `due` of a simulated link."""
+class DelayedChunk:
+    """A chunk that arrives at the step `arrival_step` of a simulated link."""
 
     link: SimulatedLink
-    due: int
+    arrival_step: int
     actions: Array | None  # None: lost
 
     def done(self) -> bool:
         """Return whether it has arrived, or never will."""
-        return self.link.now >= self.due
+        return self.link.now >= self.arrival_step
 
     def result(self) -> Array | None:
         """Return the chunk (k, D), or None if it was lost."""
@@ -180,7 +182,7 @@ class BackgroundLink:
         time.sleep(max(0.0, self._next_time - now))
         self._next_time = max(now, self._next_time) + self._period
 
-    def send(self, observation: Observation, first: bool) -> Future[Array]:
+    def send(self, observation: Observation, is_first: bool) -> Future[Array]:
         """Let the thread plan."""
         return self._thread.submit(self._time_plan, observation)
 
@@ -195,7 +197,7 @@ class BackgroundLink:
         self._thread.shutdown()
 
 
-class OverNetwork:
+class NetworkedAgent:
     """An agent at the other end of a simulated network; one that does not plan chunks has chunks of one action."""
 
     def __init__(self, agent: Agent, network: Network, spec: Spec) -> None:
@@ -224,6 +226,6 @@ class OverNetwork:
         close_agent(self._agent)
 
 
-def make_over_network(make_agent: AgentFactory, network: Network, environment: Environment) -> OverNetwork:
+def make_networked(make_agent: AgentFactory, network: Network, environment: Environment) -> NetworkedAgent:
     """Build an agent at the other end of a network for an environment."""
-    return OverNetwork(make_agent(environment), network, environment.spec)
+    return NetworkedAgent(make_agent(environment), network, environment.spec)

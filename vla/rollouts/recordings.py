@@ -20,17 +20,20 @@ Recordings = Literal["all", "failures"] | int
 
 SUCCESSES = 10  # successes beside the failures
 FAILURES_SHOWN, SUCCESSES_SHOWN = 6, 3  # moving pictures
-LARGEST, MOST = 1 << 29, 2000  # limits of a file, [bytes] and recordings: merging takes seven times its size in memory
+MAX_BYTES, MAX_RECORDINGS = (
+    1 << 29,
+    2000,
+)  # limits of a file, [bytes] and recordings: merging takes seven times its size in memory
 SUFFIXES = (".rrd", ".webp")  # of a recording and of a moving picture
 
 
-def chosen(report: Report, wanted: Recordings) -> list[Result]:
-    """Return the episodes whose recordings are `wanted`: failures first, in the order of their seeds."""
+def choose_results(report: Report, recordings: Recordings) -> list[Result]:
+    """Return the episodes that `recordings` selects: failures first, in the order of their seeds."""
     results = sorted((result for result in report.results if result.outcome != ERROR), key=lambda result: result.seed)
     failures, successes = ([result for result in results if result.success == good] for good in (False, True))
-    if wanted == "failures":
+    if recordings == "failures":
         return failures + successes[:SUCCESSES]
-    return (failures + successes)[: None if wanted == "all" else wanted]
+    return (failures + successes)[: None if recordings == "all" else recordings]
 
 
 def moving_pictures(results: Iterable[Result], folder: Path) -> list[tuple[Result, Path]]:
@@ -49,25 +52,25 @@ def moving_pictures(results: Iterable[Result], folder: Path) -> list[tuple[Resul
     return failures[:FAILURES_SHOWN] + successes[:SUCCESSES_SHOWN]
 
 
-def clear(folder: Path, kept: Container[Path] = ()) -> None:
-    """Remove the recordings and moving pictures in a folder except those that are `kept`."""
+def clear_recordings(folder: Path, keep: Container[Path] = ()) -> None:
+    """Remove the recordings and moving pictures in a folder except those in `keep`."""
     for file in folder.glob("*"):
-        if file.suffix in SUFFIXES and file not in kept:
+        if file.suffix in SUFFIXES and file not in keep:
             file.unlink()
 
 
-def merge_recordings(report: Report, folder: Path, target: Path, wanted: Recordings) -> list[int]:
-    """Merge the `wanted` recordings of an evaluation into one file, failures first; return their seeds.
+def merge_recordings(report: Report, folder: Path, target: Path, recordings: Recordings) -> list[int]:
+    """Merge the recordings that `recordings` selects into one file, failures first; return their seeds.
 
-    Those beyond `LARGEST` or `MOST` stay single files, which is logged.
+    Those beyond `MAX_BYTES` or `MAX_RECORDINGS` stay single files, which is logged.
     """
     from vla.rollouts.recorder import merge  # imports the viewer's library
 
-    names = {result.seed: recording_name(result.seed, result.outcome) for result in chosen(report, wanted)}
+    names = {result.seed: recording_name(result.seed, result.outcome) for result in choose_results(report, recordings)}
     files = {seed: folder / f"{name}.rrd" for seed, name in names.items()}
     seeds = [seed for seed, file in files.items() if file.exists()]
     sizes = accumulate(files[seed].stat().st_size for seed in seeds)
-    merged = seeds[: max(1, min(MOST, bisect_right([*sizes], LARGEST)))]
+    merged = seeds[: max(1, min(MAX_RECORDINGS, bisect_right([*sizes], MAX_BYTES)))]
     if merged:
         merge([files[seed] for seed in merged], target)
     if rest := len(seeds) - len(merged):
@@ -75,12 +78,14 @@ def merge_recordings(report: Report, folder: Path, target: Path, wanted: Recordi
     return merged
 
 
-def keep_pictures(report: Report, folder: Path, wanted: Recordings, merged: Container[int]) -> None:
-    """Keep the recordings of `wanted` episodes that were not `merged`, and the `moving_pictures` of wanted ones; remove
-    all others, and the folder if it is then empty."""
-    results = chosen(report, wanted)
+def keep_pictures(report: Report, folder: Path, recordings: Recordings, merged: Container[int]) -> None:
+    """Keep the recordings that `recordings` selects and that were not `merged`, and the `moving_pictures` of selected
+    ones; remove all others, and the folder if it is then empty."""
+    results = choose_results(report, recordings)
     paths = {file for _, file in moving_pictures(results, folder)}
     unmerged = (result for result in results if result.seed not in merged)
-    clear(folder, paths | {folder / f"{recording_name(result.seed, result.outcome)}.rrd" for result in unmerged})
+    clear_recordings(
+        folder, paths | {folder / f"{recording_name(result.seed, result.outcome)}.rrd" for result in unmerged}
+    )
     with suppress(OSError):
         folder.rmdir()

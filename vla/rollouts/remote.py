@@ -296,9 +296,9 @@ class Connection:
         if self._socket is not None:
             await self._socket.close()
 
-    def error(self, what: str) -> UserError:
+    def error(self, reason: str) -> UserError:
         """Return an error that names the server."""
-        return UserError(f"the policy server at {self.url} failed: {what}")
+        return UserError(f"the policy server at {self.url} failed: {reason}")
 
     def close(self) -> None:
         """Close the connection, and end its thread."""

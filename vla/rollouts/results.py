@@ -59,7 +59,7 @@ class Median:
         return f"{self.median:.3g}" + ("" if self.ci_low is None else f" ({self.ci_low:.3g}-{self.ci_high:.3g})")
 
 
-class Counted(NamedTuple):
+class EventRate(NamedTuple):
     """Number of completed episodes with an event, such as success, and its confidence interval."""
 
     count: int
@@ -113,7 +113,7 @@ class Report:
     def interval(self) -> tuple[float, float]:
         """95 % confidence interval of `success`; with tiers, the tasks are fixed strata."""
         if self.anytime or not self.tiers:
-            return self.counted(self.successes)[2:]
+            return self.event_rate(self.successes)[2:]
         # Known tasks only: an error in `seen` leaves other conditions without its task.
         return self._stratified([self.tasks])[1:]
 
@@ -134,7 +134,7 @@ class Report:
         return medians
 
     @property
-    def in_a_row(self) -> dict[str, int]:
+    def completion_counts(self) -> dict[str, int]:
         """Number of episodes that completed at least n of several instructions, by a label such as 1/4.
 
         Empty if the episodes have only one instruction.
@@ -144,7 +144,7 @@ class Report:
         return {f"{n}/{length}": sum(count >= n for count, _ in chains) for n in range(1, length + 1)}
 
     @property
-    def mean_in_a_row(self) -> Rate | None:
+    def mean_completed(self) -> Rate | None:
         """Mean number of instructions completed, with its 95 % confidence interval; None if episodes have only one."""
         chains = [result.completed for result in self.results if result.completed]
         if not chains:
@@ -164,29 +164,29 @@ class Report:
         return {name: self._part([name]) for name in names}
 
     @property
-    def by_tier(self) -> dict[str, Report]:
+    def tier_reports(self) -> dict[str, Report]:
         """Tier → report of its episodes; without tiers of which no episode was completed."""
         parts = {tier: self._part(self._matching(tasks), {tier: tasks}) for tier, tasks in self.tiers.items()}
         return {tier: part for tier, part in parts.items() if part.episodes}
 
-    def counted(self, count: int | None = None) -> Counted:
+    def event_rate(self, count: int | None = None) -> EventRate:
         """Return the rate of an event that `count` completed episodes had, by default of success."""
         if count is None:
-            return Counted(self.successes, self.episodes, *self.interval)
+            return EventRate(self.successes, self.episodes, *self.interval)
         episodes = self.episodes
         interval = anytime_interval(count, episodes - count) if self.anytime else wilson_interval(count, episodes)
-        return Counted(count, episodes, *interval)
+        return EventRate(count, episodes, *interval)
 
     @property
-    def rates(self) -> dict[str, dict[str, Counted]]:
+    def rates(self) -> dict[str, dict[str, EventRate]]:
         """Kind → name → rate, besides overall success: milestones, instructions completed in a row, success by task (if
         there are several, or tiers), and success by tier."""
         tasks = self.tasks if len(self.tasks) > 1 or self.tiers else {}
         return {
-            "milestones": {name: self.counted(count) for name, count in self.milestones.items()},
-            "in_a_row": {name: self.counted(count) for name, count in self.in_a_row.items()},
-            "tasks": {name: part.counted() for name, part in tasks.items()},
-            "tiers": {name: part.counted() for name, part in self.by_tier.items()},
+            "milestones": {name: self.event_rate(count) for name, count in self.milestones.items()},
+            "in_a_row": {name: self.event_rate(count) for name, count in self.completion_counts.items()},
+            "tasks": {name: part.event_rate() for name, part in tasks.items()},
+            "tiers": {name: part.event_rate() for name, part in self.tier_reports.items()},
         }
 
     def _matching(self, patterns: Sequence[str]) -> list[str]:
@@ -204,7 +204,7 @@ class Report:
 
         None with fewer than two tiers, or if it must be valid whatever the reason to stop playing.
         """
-        tiers = list(self.by_tier.values())
+        tiers = list(self.tier_reports.values())
         return None if len(tiers) < 2 or self.anytime else self._stratified([tier.tasks for tier in tiers])
 
     @staticmethod
@@ -237,17 +237,17 @@ class Report:
             lines.append(f"errors {len(self.errors)}, the first at seed {first.seed}: {first.error}")
         if medians := [f"{AMOUNTS[name]} {median}" for name, median in self.medians.items()]:
             lines.append(f"medians of the successes, {ci}: {', '.join(medians)}")
-        if row := self.mean_in_a_row:
+        if row := self.mean_completed:
             lines.append("completed in a row on average {:.2f} ({ci} {:.2f}-{:.2f})".format(*row, ci=ci))
         rates = [item for kind in self.rates.values() for item in kind.items()]
         lines += [f"{name.replace('_', ' ')} {_text(counted, ci)}" for name, counted in rates]
         if mean := self.mean_over_tiers:
             rate, low, high = (100 * value for value in mean)
             lines.append(f"{self.mean_label} {rate:.1f} % ({ci} {low:.1f}-{high:.1f})")
-        return "\n".join([*lines, f"success {_text(self.counted(), ci)}"])
+        return "\n".join([*lines, f"success {_text(self.event_rate(), ci)}"])
 
 
-def _text(counted: Counted, ci: str) -> str:
+def _text(counted: EventRate, ci: str) -> str:
     if not counted.of:
         return "0/0 (no episode was completed)"
     low, high = 100 * counted.ci_low, 100 * counted.ci_high

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vla.rollouts.worlds import Stage, copied, in_lanes, play
+from vla.rollouts.worlds import Stage, as_agents, copy_observation, play
 from vla.spec import Agent, Environment, Episode, Observation, Recorder
 
 EnvironmentFactory = Callable[[], Environment]
@@ -21,7 +21,7 @@ def rollout(
 
     Raises a UserError if an action has the wrong shape or is not finite, or the episode is over at its start.
     """
-    ((_, result),) = play([Stage(environment, recorder)], in_lanes(agent), [seed], all_images)
+    ((_, result),) = play([Stage(environment, recorder)], as_agents(agent), [seed], all_images)
     if isinstance(result, Exception):
         raise result
     return result
@@ -31,7 +31,8 @@ class Replay(NamedTuple):
     """Result of a replay."""
 
     observations: list[Observation]
-    differs: int | None  # first step with another state; number of replayed steps if only the end differs; None: equal
+    # First step with another state; number of replayed steps if only the end differs; None: equal.
+    first_difference: int | None
 
 
 def replay(environment: Environment, episode: Episode, recorder: Recorder | None = None) -> Replay:
@@ -43,7 +44,7 @@ def replay(environment: Environment, episode: Episode, recorder: Recorder | None
     for reference, action in zip(episode.observations, episode.executed, strict=True):
         if environment.done:
             break
-        observations.append(copied(observation))
+        observations.append(copy_observation(observation))
         matches.append(np.array_equal(observations[-1].state, reference.state))
         if recorder is not None:
             recorder.step(reference, action, {})

@@ -23,10 +23,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from vla.io.errors import UserError
-from vla.parallel.processes import one_thread_each, portable
-from vla.spec import Agents, Array, Environment, Observation, Running, Spec
+from vla.parallel.processes import make_picklable, one_thread_each
+from vla.spec import Agents, Array, Environment, Observation, RunningPlan, Spec
 
-MOST = 1024  # workers
+MAX_WORKERS = 1024  # workers
 
 
 class Request(NamedTuple):
@@ -57,7 +57,7 @@ def shared_policy(make_policy: Callable[[], _Planner]) -> Iterator[Callable[[Env
         with (
             ThreadPoolExecutor(1) as server,
             ExitStack() as cleanup,
-            ThreadPoolExecutor(MOST) as talks,
+            ThreadPoolExecutor(MAX_WORKERS) as talks,
             ThreadPoolExecutor(1) as acceptor,
         ):
             cleanup.callback(requests.put, None)  # once all talks have ended: each waits for its answers
@@ -128,14 +128,14 @@ def _talk(
                 requests.put(Request(kind, lane, content, answer := Future()))
                 error = answer.exception()
                 reply = None if error else (answer.result(), policy.about(lane), policy.looking(lane))
-                connection.send(portable(error) if error else reply)
+                connection.send(make_picklable(error) if error else reply)
     finally:
         memory.close()
         memory.unlink()
 
 
 def _observation(
-    memory: SharedMemory, spec: Spec, instruction: str, has_images: bool, running: Running | None
+    memory: SharedMemory, spec: Spec, instruction: str, has_images: bool, running: RunningPlan | None
 ) -> Observation:
     """Return the observation of a worker: a copy of the arrays in its shared memory, and the parts that it sent."""
     images = {name: view.copy() for name, view in _views(memory, spec).items()}

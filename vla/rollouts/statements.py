@@ -6,13 +6,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from vla.io.errors import UserError, counted
-from vla.rollouts.comparison import Together, compare_pairs, pairs_of
+from vla.rollouts.comparison import ResultPairs, compare_pairs, pairs_of
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.sequential import excludes, is_decided
 
 
 @dataclass(frozen=True)
-class AgainstBar:
+class BarStatement:
     """Comparison of the success rate with a `bar`, between 0 and 1."""
 
     bar: float
@@ -31,7 +31,7 @@ class AgainstBar:
 
 
 @dataclass(frozen=True)
-class AgainstRun:
+class RunStatement:
     """Comparison with another run on the same episodes: a difference in success, or equivalence within `margin`."""
 
     run: str
@@ -52,7 +52,7 @@ class AgainstRun:
 
         It is valid after any number of episodes. Raises a UserError if equal seeds are different episodes.
         """
-        same_seeds, pairs = self._pairs(report, alike=False), pairs_of(self._pairs(report))
+        same_seeds, pairs = self._pairs(report, same_episode=False), pairs_of(self._pairs(report))
         if sum(pairs_of(same_seeds)) and not sum(pairs):
             self.require_common(())
         ended = bool(report.results) and report.results[-1].seed >= max(self.results)
@@ -70,17 +70,17 @@ class AgainstRun:
             f"({low} to {high}), p = {test.p:.2g}"
         )
 
-    def _pairs(self, report: Report, alike: bool = True) -> Together:
+    def _pairs(self, report: Report, same_episode: bool = True) -> ResultPairs:
         """Return pairs of results, of the other run and of this one, with the same seed.
 
-        `alike`: of the same episode only; under another goal or level of randomisation a seed gives another episode.
+        `same_episode`: of the same one only; under another goal or level of randomisation a seed gives another episode.
         """
         pairs = [(self.results[result.seed], result) for result in report.results if result.seed in self.results]
         matches = [(one.instruction, one.draws) == (two.instruction, two.draws) for one, two in pairs]
-        return [pair for pair, match in zip(pairs, matches, strict=True) if match or not alike]
+        return [pair for pair, match in zip(pairs, matches, strict=True) if match or not same_episode]
 
 
-Statement = AgainstBar | AgainstRun
+Statement = BarStatement | RunStatement
 
 
 def differs_clearly(first: Report, margin: float, conditions: int, report: Report) -> bool:

@@ -53,20 +53,20 @@ def stratified_interval(strata: Sequence[tuple[int, int, float]]) -> tuple[float
     return rate, *wilson_interval(rate * effective_size, effective_size)
 
 
-def bounded_mean_interval(values: Sequence[float], largest: float) -> tuple[float, float]:
-    """Return the 95 % confidence interval of the mean of at least one value from 0 to `largest`.
+def bounded_mean_interval(values: Sequence[float], maximum: float) -> tuple[float, float]:
+    """Return the 95 % confidence interval of the mean of at least one value from 0 to `maximum`.
 
     Wilson's interval at the effective sample size, at which the binomial variance equals the estimated one; half a zero
-    and half a `largest` are added in estimating it, else equal values would seem certain. If all values are 0 or
-    `largest` it is Wilson's interval of their share.
+    and half a `maximum` are added in estimating it, else equal values would seem certain. If all values are 0 or
+    `maximum` it is Wilson's interval of their share.
     """
-    shares = np.asarray(values, float) / largest
+    shares = np.asarray(values, float) / maximum
     count, total = len(shares), float(shares.sum())
     smooth = (total + 0.5) / (count + 1)
     variance = (float(np.square(shares).sum()) + 0.5) / (count + 1) - smooth**2
     effective_size = count * smooth * (1 - smooth) / variance
     low, high = wilson_interval(total / count * effective_size, effective_size)
-    return largest * low, largest * high
+    return maximum * low, maximum * high
 
 
 def median_interval(values: Sequence[float] | Array, anytime: bool = False) -> tuple[float, float] | None:
@@ -81,7 +81,7 @@ def median_interval(values: Sequence[float] | Array, anytime: bool = False) -> t
     return (float(sorted_values[tail - 1]), float(sorted_values[-tail])) if tail else None
 
 
-def mcnemar(lost: int, won: int) -> float:
+def mcnemar(losses: int, wins: int) -> float:
     """Return the two-sided exact p-value for equal success rates, given the numbers of discordant pairs.
 
     Under the null hypothesis both kinds of pairs are equally likely (Q. McNemar, "Note on the sampling error of
@@ -89,7 +89,7 @@ def mcnemar(lost: int, won: int) -> float:
     """
     from scipy.special import bdtr  # the binomial distribution; importing scipy.stats takes a second
 
-    return min(1.0, 2 * float(bdtr(min(lost, won), lost + won, 0.5)))
+    return min(1.0, 2 * float(bdtr(min(losses, wins), losses + wins, 0.5)))
 
 
 def mean_interval(values: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from vla.rollouts.rollout import AgentFactory, close_agent
 from vla.spec import Agent, Array, Environment, Observation
 
 
-class Supervised:
+class SupervisedAgent:
     """A policy that acts while an expert labels: `info["clean"]` is the expert's action, the label to imitate."""
 
     def __init__(self, policy: Agent, expert: Agent) -> None:
@@ -44,6 +44,6 @@ def require_memoryless(expert: Agent) -> None:
         )
 
 
-def make_supervised(make_policy: AgentFactory, make_expert: AgentFactory, environment: Environment) -> Supervised:
+def make_supervised(make_policy: AgentFactory, make_expert: AgentFactory, environment: Environment) -> SupervisedAgent:
     """Build the policy and its expert for an environment."""
-    return Supervised(make_policy(environment), make_expert(environment))
+    return SupervisedAgent(make_policy(environment), make_expert(environment))

@@ -43,7 +43,7 @@ class Stage:
         The label for imitation is `info["clean"]` if present, else the action. What the agent drew, `info["draws"]`, is
         added to the draws of the environment.
         """
-        self._seen.append(copied(self._observation))
+        self._seen.append(copy_observation(self._observation))
         self._labels.append(np.array(info.get("clean", action), dtype=np.float32))
         self._executed.append(action)
         if self._recorder is not None:
@@ -101,7 +101,7 @@ class _SingleLane:
         return getattr(self.agent, "looks", True)
 
 
-def in_lanes(agent: Agent | Agents) -> Agents:
+def as_agents(agent: Agent | Agents) -> Agents:
     """Return an agent as `Agents`; an agent of one world gets a single lane."""
     return agent if isinstance(agent, Agents) else _SingleLane(agent)
 
@@ -201,8 +201,10 @@ def _actions(agents: Agents, observations: Mapping[int, Observation], components
     return answers
 
 
-def copied(seen: Observation) -> Observation:
+def copy_observation(observation: Observation) -> Observation:
     """Return a copy, with a float32 state, because a world may reuse its arrays."""
-    rgb, depth = ({name: np.array(image) for name, image in images.items()} for images in (seen.rgb, seen.depth))
-    truth = None if seen.truth is None else {name: np.array(value) for name, value in seen.truth.items()}
-    return replace(seen, rgb=rgb, depth=depth, truth=truth, state=np.array(seen.state, np.float32))
+    rgb, depth = (
+        {name: np.array(image) for name, image in images.items()} for images in (observation.rgb, observation.depth)
+    )
+    truth = None if observation.truth is None else {name: np.array(value) for name, value in observation.truth.items()}
+    return replace(observation, rgb=rgb, depth=depth, truth=truth, state=np.array(observation.state, np.float32))

@@ -11,7 +11,7 @@ from pydantic import AfterValidator
 
 from vla.config.annotations import mismatch
 from vla.config.build import arguments
-from vla.config.differences import ABSENT, at
+from vla.config.differences import ABSENT, value_at
 from vla.config.nodes import Evaluation
 from vla.config.origin import Origin
 from vla.io.documents import LENIENT, STRICT
@@ -24,15 +24,15 @@ from vla.spec import IN_DISTRIBUTION
 
 Node = dict[str, Any]
 # Values of a config that reports use, key → type; everything else is only shown.
-READ: dict[str, Any] = {"task": dict[str, object], "task.tiers": dict[str, list[str]] | None}
-READ |= {"evaluate": dict[str, object]}
-READ |= {f"evaluate.{name}": each.annotation for name, each in arguments(Evaluation).items()}
+PARSED_KEYS: dict[str, Any] = {"task": dict[str, object], "task.tiers": dict[str, list[str]] | None}
+PARSED_KEYS |= {"evaluate": dict[str, object]}
+PARSED_KEYS |= {f"evaluate.{name}": each.annotation for name, each in arguments(Evaluation).items()}
 
 
 def readable_config(config: Node) -> Node:
     """Return a config that reports can read; raise a UserError if a value that they use has the wrong type."""
-    for key, kind in READ.items():
-        if (value := at(config, key)) != ABSENT and (problem := mismatch(f"config.{key}", value, kind)):
+    for key, kind in PARSED_KEYS.items():
+        if (value := value_at(config, key)) != ABSENT and (problem := mismatch(f"config.{key}", value, kind)):
             raise UserError(problem)
     return config
 
@@ -154,7 +154,7 @@ class ReportFile:
     @cached_property
     def reports(self) -> dict[str, Report]:
         """Condition → report, the training condition first."""
-        tiers = at(self.config, "task.tiers", None) or {}  # also with tasks that were not played
+        tiers = value_at(self.config, "task.tiers", None) or {}  # also with tasks that were not played
         # Without tiers a condition may change the task of an episode; in a benchmark the task follows from the seed.
         tasks = [result.task if tiers else "" for result in self.per_episode]
         conditions = {name: part.report(self.seeds, tasks, tiers) for name, part in self.conditions.items()}

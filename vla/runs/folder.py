@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 
-from vla.config.differences import at
+from vla.config.differences import value_at
 from vla.io.documents import read_json, read_yaml
 from vla.io.errors import UserError
 from vla.io.files import require_file, write_text
@@ -55,9 +55,9 @@ class Run:
     @property
     def policy(self) -> str:
         """Name of the model's class, or of another agent's option; an empty string if unknown."""
-        if at(self.config, "agent", None):
-            return str(at(self.config, "chosen.agent", "")).replace("_", " ")
-        return str(at(self.config, "model._target_", "")).rpartition(".")[2]
+        if value_at(self.config, "agent", None):
+            return str(value_at(self.config, "chosen.agent", "")).replace("_", " ")
+        return str(value_at(self.config, "model._target_", "")).rpartition(".")[2]
 
     @property
     def tasks(self) -> list[str]:
@@ -88,7 +88,7 @@ def read_run(folder: Path) -> Run:
 
 def read_report(folder: Path) -> ReportFile | None:
     """Read the report of a run's folder, or return None; raise a UserError if the file is damaged."""
-    return _read(folder / REPORT, partial(read_json, kind=ReportFile, largest=LARGEST_REPORT), None)
+    return _read(folder / REPORT, partial(read_json, kind=ReportFile, max_bytes=LARGEST_REPORT), None)
 
 
 def read_training(folder: Path) -> Training | None:
@@ -116,7 +116,7 @@ def save_config(folder: Path, config: Mapping[str, Any], changes: list[Node]) ->
         write_text(folder / name, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
 
 
-def described(files: Sequence[Path | None]) -> str:
+def describe_files(files: Sequence[Path | None]) -> str:
     """List the files of a folder that exist, the first one with its path."""
     first, *others = [file for file in files if file and file.is_file()]
     return ", ".join([str(first), *(file.name for file in others)])

@@ -12,19 +12,19 @@ from pathlib import Path
 from typing import Any, cast
 
 from vla.io.documents import parse_json, read_bounded
-from vla.io.files import locked, write_text, writing
+from vla.io.files import try_lock, write_text, writing
 from vla.rollouts.results import Result
 
 LOCK = ".evaluation"  # held by the process that evaluates into a run's folder
-PLAYED = "played.jsonl"  # exists in a run's folder while an evaluation has no report yet
-LARGEST = 4 << 30  # of that file [bytes], millions of episodes
+RESULTS_FILE = "played.jsonl"  # exists in a run's folder while an evaluation has no report yet
+MAX_BYTES = 4 << 30  # of that file [bytes], millions of episodes
 
 log = logging.getLogger(__name__)
 
 Episode = tuple[str, Result]  # condition, result
 
 
-class Played(AbstractContextManager["Played"]):
+class PlayedEpisodes(AbstractContextManager["PlayedEpisodes"]):
     """Results so far, in a file that is removed at the end of this context, but stays after an error."""
 
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
@@ -34,10 +34,10 @@ class Played(AbstractContextManager["Played"]):
         """
         folder.mkdir(parents=True, exist_ok=True)
         busy = f"another process evaluates in {folder}: wait for it, or choose another output=DIR"
-        self._lock = locked(folder / LOCK, busy)
-        self._path, lines = folder / PLAYED, [_line(head)]
+        self._lock = try_lock(folder / LOCK, busy)
+        self._path, lines = folder / RESULTS_FILE, [_line(head)]
         self.results = defaultdict[str, dict[int, Result]](dict)  # condition → seed → result
-        text = read_bounded(self._path, LARGEST).decode("utf-8", "replace") if self._path.is_file() else ""
+        text = read_bounded(self._path, MAX_BYTES).decode("utf-8", "replace") if self._path.is_file() else ""
         if text.startswith(lines[0]):
             for line in text.split("\n")[1:]:
                 try:

@@ -13,7 +13,7 @@ from vla.config.adopt import require_identity
 from vla.config.differences import differences
 from vla.data.index import INDEX
 from vla.io.errors import UserError, counted
-from vla.io.files import locked
+from vla.io.files import try_lock
 from vla.models.checkpoint import Header, read_header
 from vla.models.policy_folder import POLICY, read_policy
 from vla.runs.folder import CHECKPOINTS, LAST, REPORT, read_report
@@ -95,7 +95,9 @@ def training_lock(folder: Path) -> Iterator[None]:
         yield
         return
     folder.mkdir(parents=True, exist_ok=True)
-    lock = locked(folder / LOCK, f"another process is training in {folder}: wait for it, or choose another output=DIR")
+    lock = try_lock(
+        folder / LOCK, f"another process is training in {folder}: wait for it, or choose another output=DIR"
+    )
     try:
         yield
     finally:

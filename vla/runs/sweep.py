@@ -40,7 +40,7 @@ class SweepRow:
         return [run.reports[IN_DISTRIBUTION].success for run in self.runs]
 
     @cached_property
-    def played(self) -> dict[str, list[dict[int, bool]]]:
+    def successes(self) -> dict[str, list[dict[int, bool]]]:
         """Condition → for every cell, seed → success; without errors."""
         outcomes: dict[str, list[dict[int, bool]]] = {}
         for condition, report in (item for run in self.runs for item in run.reports.items()):
@@ -51,21 +51,21 @@ class SweepRow:
     @property
     def episodes(self) -> dict[str, int]:
         """Condition → number of episodes over all cells."""
-        return {condition: sum(map(len, cells)) for condition, cells in self.played.items()}
+        return {condition: sum(map(len, cells)) for condition, cells in self.successes.items()}
 
     def interval(self, condition: str) -> tuple[float, float, float]:
         """Return the success rate and its 95 % confidence interval; of several cells, over trainings and scenes."""
         if len(self.runs) == 1:  # the interval of its report: stratified with tiers, anytime-valid after early stopping
             report = self.runs[0].reports[condition]
             return (report.success, *report.interval)
-        successes = sum(sum(cell.values()) for cell in self.played[condition])
+        successes = sum(sum(cell.values()) for cell in self.successes[condition])
         rate = successes / max(self.episodes[condition], 1)
-        return (rate, *pooled_interval(self.played[condition]))
+        return (rate, *pooled_interval(self.successes[condition]))
 
 
 def conditions_of(rows: list[SweepRow]) -> list[str]:
     """Return the conditions of all rows, in the order in which they appear."""
-    return list(dict.fromkeys(condition for row in rows for condition in row.played))
+    return list(dict.fromkeys(condition for row in rows for condition in row.successes))
 
 
 def read_rows(folder: Path) -> list[SweepRow]:

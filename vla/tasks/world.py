@@ -11,7 +11,7 @@ from zlib import crc32
 import numpy as np
 
 from vla.io.errors import UserError
-from vla.parallel.limits import scarce_memory
+from vla.parallel.limits import is_memory_scarce
 
 FREE = 0.25  # share of the memory that scenes leave free
 Scene = TypeVar("Scene")
@@ -44,7 +44,7 @@ class World:
             self._blind = was_blind
 
 
-class ManyTasks(World):
+class MultitaskWorld(World):
     """Base class of worlds with several `tasks`, through which seeds cycle, in scenes that are made when first played.
 
     When memory is scarce, a new scene replaces the newest one: in the cycle, the oldest scenes are needed again first.
@@ -63,7 +63,7 @@ class ManyTasks(World):
     def _scene_of(self, name: str, make: Callable[[], Scene]) -> Scene:
         """Return the scene called `name`, which `make` makes if there is none."""
         if name not in self._scenes:
-            if self._scenes and scarce_memory(FREE):
+            if self._scenes and is_memory_scarce(FREE):
                 self._scenes.popitem()[1].close()
             self._scenes[name] = make()
         return self._scenes[name]

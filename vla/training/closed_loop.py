@@ -17,7 +17,7 @@ from vla.models.learner import Learner
 from vla.models.model import Model
 from vla.models.policy_folder import BEST
 from vla.parallel.limits import free_memory
-from vla.parallel.pool import Crashed, Future, ProcessPool
+from vla.parallel.pool import Future, ProcessPool, WorkerCrash
 from vla.parallel.processes import one_thread_each
 from vla.rollouts.evaluate import play_episode
 from vla.rollouts.results import ERROR, Result
@@ -28,7 +28,9 @@ from vla.training.device import memory_of
 log = logging.getLogger(__name__)
 
 ROOM = 3  # memory of a process with a model, as a multiple of its weights: they arrive pickled, and the model acts
-OF_GPU = 1e9  # memory of a process that uses a GPU, without its model: of the GPU, and of the machine [bytes]
+GPU_PROCESS_MEMORY = (
+    1e9  # memory of a process that uses a GPU, without its model: of the GPU, and of the machine [bytes]
+)
 PER_WORKER = 5  # smallest number of episodes per process; fewer would take less time than its start
 
 
@@ -145,7 +147,7 @@ class ClosedLoop(Callback):
             self.best = self.success
             trainer.save_checkpoint(self._path, weights_only=False)
 
-    def clearly_better(self) -> Path | None:
+    def clearly_better_policy(self) -> Path | None:
         """Return `policy_best` if the last success rate is below the 95 % confidence interval of the best, else None.
 
         Smaller differences in a few episodes are mostly chance, and then longer training is better.
@@ -170,12 +172,12 @@ class ClosedLoop(Callback):
 
 def processes_that_fit(device: torch.device, size: float) -> int:
     """Return how many processes have memory for a model of `size` [bytes] on a device, each with a copy of its own."""
-    overhead = OF_GPU if device.type == "cuda" else 0
+    overhead = GPU_PROCESS_MEMORY if device.type == "cuda" else 0
     return int(min(memory_of(device)[1], free_memory()) / (ROOM * size + overhead))
 
 
 def _results(future: Future, seeds: Sequence[int]) -> list[Result]:
     try:
         return future.result()
-    except Crashed as crash:
+    except WorkerCrash as crash:
         return [Result(seed, ERROR, error=str(crash)) for seed in seeds]

@@ -14,7 +14,7 @@ import torch
 from vla.parallel.limits import free_memory
 
 
-def now(device: torch.device) -> float:
+def synchronized_time(device: torch.device) -> float:
     """Wait for the work of a device and return the time [s]."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -11,7 +11,7 @@ from torch.distributed.checkpoint.state_dict import StateDictOptions, set_model_
 
 from vla.models.fsdp import full_tensor, local_shard, reshard
 
-EVERY = 4  # steps; an update takes a twentieth of the step of a small model
+UPDATE_INTERVAL = 4  # steps; an update takes a twentieth of the step of a small model
 
 
 class EMA(Callback):
@@ -46,10 +46,10 @@ class EMA(Callback):
         self._step = trainer.global_step
         if not self._average:
             self._average = [weight.clone() for weight in _weights_of(pl_module).values()]
-        elif self._step % EVERY == 0:
+        elif self._step % UPDATE_INTERVAL == 0:
             weights = _weights_of(pl_module).values()
             # Bias correction, as for Adam's moments (arXiv 1412.6980, section 3).
-            share = (1 - self._decay**EVERY) / (1 - self._decay**self._step)
+            share = (1 - self._decay**UPDATE_INTERVAL) / (1 - self._decay**self._step)
             # One fused kernel, which cannot mix plain and sharded tensors.
             torch._foreach_lerp_([*map(local_shard, self._average)], [*map(local_shard, weights)], share)
 

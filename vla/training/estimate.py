@@ -19,17 +19,17 @@ from torch import Tensor
 from vla.io.errors import UserError, counted
 from vla.models.fsdp import local_shard
 from vla.models.learner import Learner
-from vla.training.device import memory_of, now, peak, reset_peak
-from vla.training.ema import EMA, EVERY
+from vla.training.device import memory_of, peak, reset_peak, synchronized_time
+from vla.training.ema import EMA, UPDATE_INTERVAL
 from vla.training.trainer import what_to_lower
 
 log = logging.getLogger(__name__)
 
 TRIALS_S = 2.0  # after which no larger batch is tried [s], unless the training is long
-LONG = 500  # smallest number of batches of a long training, whose trials go on up to its batch size
+LONG_TRAINING = 500  # smallest number of batches of a long training, whose trials go on up to its batch size
 TOLERANCE = 1.15  # a training is refused if it needs more than this multiple of the available memory
 SCARCE = 0.5  # share of the memory above which a training says what to lower
-OPTIMIZED = 20_000_000  # number of parameters with which a step of the optimiser is timed
+OPTIMIZER_SAMPLE = 20_000_000  # number of parameters with which a step of the optimiser is timed
 FIRST_STEP = 40e6  # memory that libraries allocate in the first step, measured for four models [bytes]
 GB = 1e9
 
@@ -72,8 +72,8 @@ class Estimate(Callback):
             window = self._run_trials(trainer, pl_module, data)
             optimizer = _optimizer_seconds(weights, device, bool(averages))
         waiting = (data.ahead + 2) * data.batch_size * window + FIRST_STEP if on_cpu else 0  # Lightning takes one ahead
-        self.memory = extrapolated(self._peaks, data.batch_size) + state + waiting
-        self.seconds = extrapolated(self._seconds, data.batch_size) + optimizer / trainer.accumulate_grad_batches
+        self.memory = extrapolate(self._peaks, data.batch_size) + state + waiting
+        self.seconds = extrapolate(self._seconds, data.batch_size) + optimizer / trainer.accumulate_grad_batches
         self._require(self.memory)
 
     def _require(self, needed: float) -> None:
@@ -97,9 +97,9 @@ class Estimate(Callback):
                 return window
             next_size = min(4 * windows, data.batch_size)
             duration = time.perf_counter() - start + 2 * self._seconds[windows] * next_size / windows  # after two steps
-            long = not 0 <= batches_left(trainer) < LONG
+            long = not 0 <= batches_left(trainer) < LONG_TRAINING
             affordable = long or duration < (TRIALS_S if windows > 2 else 5 * TRIALS_S)  # a line needs a second trial
-            fits = extrapolated(self._peaks, next_size) < self._capacity
+            fits = extrapolate(self._peaks, next_size) < self._capacity
             if not trainer.strategy.reduce_boolean_decision(affordable and fits, all=True):
                 return window
             windows = next_size
@@ -155,29 +155,30 @@ def _preserved_state(learner: Learner) -> Iterator[None]:
 
 def _step(trainer: Trainer, learner: Learner, batch: Any) -> float:
     """Return the time of a step without the optimiser [s]; as in training, previous gradients are still allocated."""
-    start = now(learner.device)
+    start = synchronized_time(learner.device)
     with trainer.precision_plugin.train_step_context():
         loss = learner.model.loss(learner.model.augment(batch))["loss"]
     learner.zero_grad()
     loss.backward()
-    return now(learner.device) - start
+    return synchronized_time(learner.device) - start
 
 
 def _optimizer_seconds(weights: list[Tensor], device: torch.device, averages: bool) -> float:
     """Return the time of clipping, AdamW and EMA [s], extrapolated from zeros in the shape of some of the weights."""
     sample = list[Tensor]()
     for weight in weights:
-        if sum(tensor.numel() for tensor in sample) < OPTIMIZED:
+        if sum(tensor.numel() for tensor in sample) < OPTIMIZER_SAMPLE:
             sample.append(torch.zeros_like(weight, requires_grad=True))
             sample[-1].grad = torch.zeros_like(weight)
     optimizer, seconds = torch.optim.AdamW(sample, fused=True), list[float]()
     for _ in range(3):
-        start = now(device)
+        start = synchronized_time(device)
         torch.nn.utils.clip_grad_norm_(sample, 1.0)
         optimizer.step()
-        seconds.append(now(device) - start)
+        seconds.append(synchronized_time(device) - start)
     share = sum(tensor.numel() for tensor in sample) / sum(tensor.numel() for tensor in weights)
-    return min(seconds) / share * (1 + averages / (3 * EVERY))  # EMA reads and writes a third of what AdamW does
+    # EMA reads and writes a third of what AdamW does.
+    return min(seconds) / share * (1 + averages / (3 * UPDATE_INTERVAL))
 
 
 def batches_left(trainer: Trainer) -> int:
@@ -185,7 +186,7 @@ def batches_left(trainer: Trainer) -> int:
     return (trainer.max_steps - trainer.global_step) * trainer.accumulate_grad_batches
 
 
-def extrapolated(points: Mapping[int, float], size: int) -> float:
+def extrapolate(points: Mapping[int, float], size: int) -> float:
     """Return the value at a size: that of its point, or else that of the line through the last two points."""
     (first_size, low), (last_size, high) = list(points.items())[-2:]
     return points[size] if size in points else high + max(high - low, 0) / (last_size - first_size) * (size - last_size)

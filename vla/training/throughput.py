@@ -10,7 +10,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from vla.io.progress import Bar
 
-MUCH = 0.05  # share of time spent waiting for data above which the bar shows it
+MAX_WAITING_SHARE = 0.05  # share of time spent waiting for data above which the bar shows it
 
 
 class Throughput(Callback):
@@ -93,7 +93,7 @@ class TrainingProgressBar(Callback):
             notes.append(f"{metrics['pace/samples_per_s']:.0f} samples/s")
         if "val/success" in metrics:
             notes.append(f"success {metrics['val/success']:.0%}")
-        if metrics.get("pace/waiting", 0) > MUCH:
+        if metrics.get("pace/waiting", 0) > MAX_WAITING_SHARE:
             notes.append(f"waiting {metrics['pace/waiting']:.0%}")
         self._bar.show(batch_idx + 1, ", ".join(notes))
 

@@ -23,7 +23,7 @@ from lightning.pytorch.strategies import ParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from vla.config.build import build
-from vla.config.differences import at
+from vla.config.differences import value_at
 from vla.io.errors import UserError
 from vla.models.checkpoint import read_header
 from vla.parallel.limits import cores
@@ -68,9 +68,9 @@ class SyncBatchNorm(TorchSyncBatchNorm):
 
     def apply(self, model: torch.nn.Module) -> torch.nn.Module:
         """Return the model with its layers converted."""
-        from vla.models.vision.timm_encoders import synchronised
+        from vla.models.vision.timm_encoders import synchronize_batch_norm
 
-        return synchronised(model)
+        return synchronize_batch_norm(model)
 
 
 def make_trainer(config: Mapping[str, Any], checkpoints: Path, *callbacks: Callback) -> Trainer:
@@ -148,7 +148,7 @@ def explain_memory_errors(config: Mapping[str, Any]) -> Iterator[None]:
 
 def what_to_lower(config: Mapping[str, Any]) -> str:
     """Return which options to change so that training needs less memory."""
-    keys = [f"{key} (now {size})" for key in SIZE_KEYS if (size := at(config, key, None))]
+    keys = [f"{key} (now {size})" for key in SIZE_KEYS if (size := value_at(config, key, None))]
     return (
         f"lower {', '.join(keys)}; trainer.precision=bf16 and learner.checkpointing=true need less, and "
         "half the data.batch_size with trainer.accumulate_grad_batches=2 trains on as many windows per step"

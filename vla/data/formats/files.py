@@ -19,7 +19,7 @@ from vla.data.episodes import EpisodeStore
 from vla.data.index import Entry
 from vla.io.documents import read_json
 from vla.io.errors import UserError
-from vla.io.files import locked, write_json, writing
+from vla.io.files import try_lock, write_json, writing
 from vla.io.printable import track
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster, WorkersLost
@@ -97,7 +97,7 @@ def staging_folder(folder: Path) -> Iterator[Path]:
     """
     staging = folder.with_name(f".{folder.name}.unfinished")
     staging.mkdir(parents=True, exist_ok=True)
-    lock = locked(staging / "lock", f"another export to {folder} is under way: wait, or choose another export.folder")
+    lock = try_lock(staging / "lock", f"another export to {folder} is under way: wait, or choose another export.folder")
     try:
         with writing(folder):
             yield staging

@@ -142,12 +142,12 @@ def action_bounds(values: Array) -> tuple[float, float]:
     return lower - margin, upper + margin
 
 
-def out_of_bounds(actions: Array, spec: Spec, most: float) -> list[str]:
-    """Describe components that exceed the bounds in more than the share `most` of the (N, D) actions: other units."""
+def out_of_bounds(actions: Array, spec: Spec, max_share: float) -> list[str]:
+    """Describe components that exceed the bounds in more than a share `max_share` of (N, D) actions: other units."""
     descriptions = list[str]()
     for index, (name, low, high) in enumerate(zip(spec.action, spec.low, spec.high, strict=True)):
         values, slack = actions[:, index], BOUNDS_TOLERANCE * (high - low)
-        if (share := ((values < low - slack) | (values > high + slack)).mean()) > most:
+        if (share := ((values < low - slack) | (values > high + slack)).mean()) > max_share:
             unit = "" if spec.units[index] == "1" else f" {spec.units[index]}"
             descriptions.append(
                 f"its action {name} is from {values.min():.3g} to {values.max():.3g}, {share:.0%} of it beyond the "

@@ -21,8 +21,8 @@ import pyarrow.parquet as pq
 from vla.data.formats import lerobot_layout as layout
 from vla.data.formats import lerobot_tables as tables
 from vla.data.formats.lerobot_images import decode, require_video
-from vla.data.formats.lerobot_tables import COUNTS, MEND, NUMBERS, PICTURES, REMEDY, TIMES
-from vla.data.index import listed
+from vla.data.formats.lerobot_tables import CORRECTION, COUNTS, NUMBERS, PICTURES, REMEDY, TIMES
+from vla.data.index import format_numbers
 from vla.io.documents import read_bounded, read_json
 from vla.io.errors import UserError
 from vla.io.images import decode_image, resize
@@ -30,7 +30,7 @@ from vla.spec import LONGEST_INSTRUCTION, Array
 
 IMAGES = ("video", "image")
 MAX_COMPONENTS = 10_000  # of a feature; a damaged or hostile file may name any number
-OWNER, TASK, TIME, FROM, TO = "episode_index", "task_index", "timestamp", "dataset_from_index", "dataset_to_index"
+OWNER, TASK, TIME, START, END = "episode_index", "task_index", "timestamp", "dataset_from_index", "dataset_to_index"
 UNNAMED = "__index_level_0__"  # column of an index that pandas writes without a name
 
 
@@ -117,7 +117,7 @@ class LeRobotDataset:
             if values is None or not len(values):
                 raise UserError(
                     f"{self.folder}/data has rows of {key} without the {size} numbers that meta/info.json states: "
-                    f"{MEND}"
+                    f"{CORRECTION}"
                 )
             self._require_finite(key, values, rows[OWNER].to_numpy())
             arrays[key] = values
@@ -147,7 +147,7 @@ class LeRobotDataset:
         owner, tasks = rows[OWNER].to_numpy(), rows[TASK].to_numpy()
         stamps = tables.vectors(rows[TIME], 1, np.float64)
         if stamps is None:
-            raise UserError(f"{self.folder}/data has rows of {TIME} that are not one number: {MEND}")
+            raise UserError(f"{self.folder}/data has rows of {TIME} that are not one number: {CORRECTION}")
         self._require_finite(TIME, stamps, owner)
         order, numbers = np.argsort(owner, kind="stable"), [row[OWNER] for row in episodes]
         starts, ends = (np.searchsorted(owner[order], numbers, side) for side in ("left", "right"))
@@ -155,8 +155,11 @@ class LeRobotDataset:
         for row, start, end in zip(episodes, starts, ends, strict=True):
             steps, number = order[start:end], row[OWNER]
             times = stamps[steps, 0]
-            if len(steps) != (count := row[TO] - row[FROM]) or not count:
-                content, remedy = f"{len(steps)} steps of episode {number}", REMEDY if len(steps) < count else MEND
+            if len(steps) != (count := row[END] - row[START]) or not count:
+                content, remedy = (
+                    f"{len(steps)} steps of episode {number}",
+                    REMEDY if len(steps) < count else CORRECTION,
+                )
                 raise UserError(f"{self.folder}/data holds {content}, and meta/episodes counts {count}: {remedy}")
             self._require_even(number, times - times[0])
             files = tuple(paths[index] for index in np.unique(file[steps]))
@@ -165,24 +168,24 @@ class LeRobotDataset:
             for begin, stop in pairwise([0, *changes.tolist(), len(steps)]):
                 if (task := int(tasks[steps[begin]])) not in instructions:
                     path = self.folder / layout.TASKS
-                    raise UserError(f"{path} lacks task {task}, which episode {number} has: {MEND}")
+                    raise UserError(f"{path} lacks task {task}, which episode {number} has: {CORRECTION}")
                 span = slice(begin, stop)
                 parts.append(Part(number, steps, files, span, instructions[task], float(times[0]), row))
         return parts
 
     def _read_episodes(self, videos: Sequence[str]) -> list[dict[str, Any]]:
         """Return the rows of `meta/episodes`, in the order of the episodes."""
-        folder, columns = self.folder / "meta/episodes", dict.fromkeys((OWNER, FROM, TO), COUNTS)
+        folder, columns = self.folder / "meta/episodes", dict.fromkeys((OWNER, START, END), COUNTS)
         for video in (f"videos/{key}" for key in videos):
             columns |= {f"{video}/chunk_index": COUNTS, f"{video}/file_index": COUNTS}
             columns |= {f"{video}/from_timestamp": TIMES, f"{video}/to_timestamp": TIMES}
         rows = tables.read(tables.files(folder), columns).sort_by(OWNER).to_pylist()
         if duplicates := [row[OWNER] for row, next_row in pairwise(rows) if row[OWNER] == next_row[OWNER]]:
-            raise UserError(f"{folder} lists episode {duplicates[0]} more than once: {MEND}")
+            raise UserError(f"{folder} lists episode {duplicates[0]} more than once: {CORRECTION}")
         # An incomplete copy has the totals of the whole dataset; more episodes than in the totals are no damage.
         counts = (
             ("episodes", len(rows), self.info.total_episodes),
-            ("frames", sum(row[TO] - row[FROM] for row in rows), self.info.total_frames),
+            ("frames", sum(row[END] - row[START] for row in rows), self.info.total_frames),
         )
         for noun, count, total in counts:
             if count < total:
@@ -226,7 +229,7 @@ class LeRobotDataset:
         if picture.get("bytes"):
             return picture["bytes"]
         if not (path := str(picture.get("path") or "").replace("\0", "")):  # which no path has
-            raise UserError(f"there is no image: {MEND}")
+            raise UserError(f"there is no image: {CORRECTION}")
         folder = os.path.realpath(self.folder)
         file = Path(os.path.realpath(os.path.join(folder, path)))  # untrusted, it could lead anywhere
         if not file.is_relative_to(folder) or not os.path.isfile(file):
@@ -303,11 +306,15 @@ def _read_instructions(path: Path) -> dict[int, str]:
     texts = [field.name for field in schema if tables.is_text(field.type)]
     columns = [name for name in (UNNAMED, "task") if name in texts] or (texts if len(texts) == 1 else [])
     if not columns:
-        raise UserError(f"{path} has the columns {', '.join(schema.names)[:200]}, but no column task of texts: {MEND}")
+        raise UserError(
+            f"{path} has the columns {', '.join(schema.names)[:200]}, but no column task of texts: {CORRECTION}"
+        )
     table = tables.read([path], {TASK: COUNTS, columns[0]: tables.TEXTS})
     tasks = dict(zip(table[TASK].to_pylist(), table[columns[0]].to_pylist(), strict=True))
     if indices := [index for index, text in tasks.items() if len(text) > LONGEST_INSTRUCTION]:
-        raise UserError(f"{path}: shorten the tasks {listed(indices)}, of more than {LONGEST_INSTRUCTION} characters")
+        raise UserError(
+            f"{path}: shorten the tasks {format_numbers(indices)}, of more than {LONGEST_INSTRUCTION} characters"
+        )
     return tasks
 
 

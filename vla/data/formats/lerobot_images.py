@@ -21,7 +21,7 @@ from vla.spec import Array
 
 CODEC = "libsvtav1"
 PIXELS = "yuv420p"  # the only layout that the encoder supports
-AGAIN = "copy the video again from where it is whole, or encode it again"
+VIDEO_REMEDY = "copy the video again from where it is whole, or encode it again"
 
 
 def encode(path: Path, clips: Iterable[Array], size: tuple[int, int], fps: Fraction, crf: int) -> None:
@@ -84,7 +84,7 @@ def decode(
             if next_number >= count or number > next_number:
                 break
     if next_number < count:
-        raise UserError(f"{path} lacks the frame at {start + next_number / float(fps):.3f} s: {AGAIN}")
+        raise UserError(f"{path} lacks the frame at {start + next_number / float(fps):.3f} s: {VIDEO_REMEDY}")
 
 
 def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) -> None:
@@ -102,7 +102,7 @@ def require_video(path: Path, size: tuple[int, int], fps: Fraction, count: int) 
             "that rate, or write its own as fps into meta/info.json"
         )
     if 0 < frames < count:  # 0: unknown
-        raise UserError(f"{path} has {frames} images of the {count} that the dataset needs: {AGAIN}")
+        raise UserError(f"{path} has {frames} images of the {count} that the dataset needs: {VIDEO_REMEDY}")
 
 
 @contextmanager
@@ -113,7 +113,7 @@ def _open_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.Vi
         with av.open(path, format="mp4") as file:  # other formats may be playlists of files anywhere
             yield file, file.streams.video[0]
     except (av.error.FFmpegError, OSError, IndexError) as error:
-        raise UserError(f"{path} cannot be read as a video ({error}): {AGAIN}") from error
+        raise UserError(f"{path} cannot be read as a video ({error}): {VIDEO_REMEDY}") from error
 
 
 def _require_size(path: Path, images: av.VideoStream | av.VideoFrame, size: tuple[int, int]) -> None:

@@ -20,7 +20,7 @@ from vla.io.files import require_file
 from vla.spec import Array
 
 REMEDY = "copy the dataset again from where it is whole"  # where a copy may be damaged or incomplete
-MEND = "correct the dataset, or write it again"  # where a copy cannot help
+CORRECTION = "correct the dataset, or write it again"  # where a copy cannot help
 MAX_ROWS = 10_000_000  # of a file: 280 hours at 10 Hz
 MAX_BYTES = 2**33  # to unpack at once
 MAX_SECONDS = 1e6  # video [s]
@@ -89,7 +89,9 @@ def read(paths: Sequence[Path], columns: Mapping[str, Kind], only: Any = None) -
     try:
         return pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
-        raise UserError(f"{paths[0]} and files beside it have other types ({str(error)[:200]}): {MEND}") from error
+        raise UserError(
+            f"{paths[0]} and files beside it have other types ({str(error)[:200]}): {CORRECTION}"
+        ) from error
 
 
 def _unpacked_size(path: Path, columns: Collection[str], filtered: bool) -> int:
@@ -109,7 +111,7 @@ def require(path: Path, columns: Mapping[str, Kind]) -> None:
     """Raise a UserError unless a file has columns of the expected types; their values are not read."""
     empty_table = schema_of(path).empty_table()
     if wrong_columns := [name for name in columns if empty_table.column_names.count(name) != 1]:
-        raise UserError(f"{path} lacks the columns {', '.join(wrong_columns)}, or has them twice: {MEND}")
+        raise UserError(f"{path} lacks the columns {', '.join(wrong_columns)}, or has them twice: {CORRECTION}")
     _require_kinds(path, empty_table, columns)
 
 
@@ -129,7 +131,7 @@ def schema_of(path: Path) -> pa.Schema:
 def _require_kinds(path: Path, table: pa.Table, columns: Mapping[str, Kind]) -> None:
     for name, (kind, holds) in columns.items():
         if not holds(table[name]):
-            raise UserError(f"{path}: {name} does not hold {kind}: {MEND}")
+            raise UserError(f"{path}: {name} does not hold {kind}: {CORRECTION}")
 
 
 def vectors(column: Column, size: int, dtype: type[np.floating] = np.float32) -> Array | None:

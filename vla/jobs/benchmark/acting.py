@@ -12,7 +12,7 @@ from torch import Tensor
 
 from vla.config.build import Group, build
 from vla.config.compose import compose
-from vla.config.experiment import Experiment, plain
+from vla.config.experiment import Experiment, to_plain
 from vla.config.nodes import Benchmark
 from vla.io.errors import UserError
 from vla.jobs.benchmark.measure import Measure, measure, timed
@@ -63,7 +63,7 @@ def _require_equal(peer_actions: Tensor, actions: Tensor) -> None:
 def evaluate(experiment: Experiment) -> dict[str, Measure]:
     """Measure `job=evaluate` with every recording, in episodes per second; the floor is the same without recordings."""
     count, rates = experiment.options(Benchmark).episodes, []
-    for recorder in (plain(compose().recorder), None):
+    for recorder in (to_plain(compose().recorder), None):
         with TemporaryDirectory() as folder:
             values = {"job": "evaluate", "evaluate.episodes": count, "evaluate.recordings": "all"}
             trial = experiment.with_values({**values, "recorder": recorder, "output": folder})

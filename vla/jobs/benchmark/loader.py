@@ -47,7 +47,7 @@ def _measure_large_images(experiment: Experiment, chunk: int) -> dict[str, Measu
     environment.close()
     spec = replace(environment.spec, cameras=tuple(episodes[0].observations[0].rgb), depth=(), parts=())
     variant = experiment.with_values({"collect.episodes": len(seeds), "data.validation_fraction": 0})
-    for codec in (Codec.suited(spec), Codec("jpeg", experiment.collect.quality)):
+    for codec in (Codec.for_spec(spec), Codec("jpeg", experiment.collect.quality)):
         with TemporaryDirectory() as folder:
             store = EpisodeStore.create_or_open(folder, spec, {}, codec)
             with store.writing():

@@ -15,7 +15,7 @@ from vla.config.nodes import Benchmark
 from vla.jobs.benchmark.measure import Measure, measure
 from vla.jobs.collect import demonstrations
 from vla.runs.folder import CHECKPOINTS
-from vla.training.device import now
+from vla.training.device import synchronized_time
 from vla.training.trainer import explain_memory_errors, make_trainer, quiet_lightning
 
 WARM_UP = 3  # steps of a round that are not timed: they allocate and compile
@@ -73,7 +73,7 @@ class _Stopwatch(lightning.Callback):
     ) -> None:
         """Start the clock after the warm-up, and stop it after the last step."""
         if batch_idx + 1 in (WARM_UP, WARM_UP + self.steps):
-            self.seconds = now(pl_module.device) - self.seconds
+            self.seconds = synchronized_time(pl_module.device) - self.seconds
             self._batch = batch
 
     def on_train_end(self, trainer: Any, pl_module: Any) -> None:
@@ -81,12 +81,12 @@ class _Stopwatch(lightning.Callback):
         model, optimizer = pl_module.model, torch.optim.AdamW(pl_module.model.parameters(), fused=True)
         for step in range(WARM_UP + self.steps):
             if step == WARM_UP:
-                self.alone = now(pl_module.device)
+                self.alone = synchronized_time(pl_module.device)
             optimizer.zero_grad()
             with trainer.precision_plugin.train_step_context():
                 loss = model.loss(model.augment(self._batch))["loss"]
             loss.backward()
             optimizer.step()
-        self.alone = now(pl_module.device) - self.alone
+        self.alone = synchronized_time(pl_module.device) - self.alone
         del self._batch
         pl_module.zero_grad()

@@ -11,7 +11,7 @@ import numpy as np
 TERMS = ("black", "white", "grey", "red", "green", "yellow", "blue", "brown", "orange", "pink", "purple")
 
 
-def in_basic_terms(words: Sequence[str]) -> list[str]:
+def to_basic_terms(words: Sequence[str]) -> list[str]:
     """Replace each name of a colour, of one or several words, by a basic term: navy blue by blue, crimson by red.
 
     The mapping is not learned but comes from a survey, see `terms`; it covers names that training does not contain.

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 WEIGHTS = "model*.safetensors"
 ADAPTER = "adapter_config.json"  # of an adapter that transformers would load, but whose SHA-256 would not be checked
 FILES = ("config.json", "tokenizer.json", "tokenizer_config.json", WEIGHTS, "model.safetensors.index.json")
-KEPT = 1 << 13  # sentence vectors, 4 kB of 1024 components each
+CACHE_SIZE = 1 << 13  # sentence vectors, 4 kB of 1024 components each
 
 # Models that contain more than a text encoder → class of that part, and its output that is a sentence vector, if any.
 TEXT_PARTS = {
@@ -78,7 +78,7 @@ class SentenceEncoder:
         """Return the vector of a sentence, (E,) float32: the network's own if it has one, else the mean over tokens."""
         vector = self._vectors.get(sentence)
         if vector is None:
-            if len(self._vectors) >= KEPT:
+            if len(self._vectors) >= CACHE_SIZE:
                 self._vectors.clear()
             vector = self._vectors[sentence] = self._embed(sentence)
         return vector

@@ -18,11 +18,11 @@ from torch import Tensor, nn
 
 from vla.io.errors import UserError
 from vla.io.types import Rate
-from vla.models.text.colours import in_basic_terms
+from vla.models.text.colours import to_basic_terms
 
 PADDING = 0
 CHARACTERS = 3  # length of character n-grams
-KEPT = 1 << 13  # sentences whose hashes are cached: 1.5 kB each, 10 kB for the longest
+CACHE_SIZE = 1 << 13  # sentences whose hashes are cached: 1.5 kB each, 10 kB for the longest
 INITIAL_STD = 0.1  # of embeddings; small, so that untrained n-grams have little effect
 PRIME, FACTOR = 2**31 - 1, 1_000_003  # of the polynomial hash of n-grams; its products fit into 64 bits
 
@@ -140,7 +140,7 @@ def _replacements(synonyms: Mapping[str, Sequence[str]]) -> dict[str, str]:
     return dict(sorted(pairs, key=lambda pair: -len(pair[0])))
 
 
-@lru_cache(KEPT)
+@lru_cache(CACHE_SIZE)
 def _hashes(
     sentence: str, vocabulary: int, longest: int | None, basic_colours: bool, replacements: tuple[tuple[str, str], ...]
 ) -> Tensor:
@@ -148,7 +148,7 @@ def _hashes(
     if replacements:
         table = dict(replacements)
         sentence = re.sub(rf"\b(?:{'|'.join(map(re.escape, table))})\b", lambda word: table[word[0]], sentence.lower())
-    words = in_basic_terms(words_of(sentence)) if basic_colours else words_of(sentence)
+    words = to_basic_terms(words_of(sentence)) if basic_colours else words_of(sentence)
     # crc32, because hash() differs between processes.
     if longest is None:
         return torch.tensor([1 + zlib.crc32(word.encode()) % (PRIME - 1) for word in words] or [PADDING])

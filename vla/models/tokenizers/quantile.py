@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from vla.io.types import Bins
-from vla.models.tokenizers.tokenizer import PerComponent, data_bounds
+from vla.models.tokenizers.tokenizer import ComponentTokenizer, data_bounds
 from vla.spec import ActionStatistics, Spec
 
 
-class Quantile(PerComponent):
+class Quantile(ComponentTokenizer):
     """Bins between the quantiles of the data per component, decoded as the mean of the data in them.
 
     Small motions, which are frequent, get narrow bins, and large ones wide bins. There is no bias on the fitted data.

@@ -67,7 +67,7 @@ class ActionTokenizer(nn.Module, ABC):
         """Return the (…, L) losses of (…, L, K) logits against the (…, L) tokens of (…, k, D) actions."""
         return _hard_cross_entropy(logits, tokens)
 
-    def sampled(self, tokens: Tensor, actions: Tensor) -> Tensor:
+    def sample_inputs(self, tokens: Tensor, actions: Tensor) -> Tensor:
         """Sample (…, L) decoder inputs near the (…, L) tokens of (…, k, D) actions, by default the tokens themselves.
 
         Such noise makes the decoder robust to errors in its own prefix.
@@ -79,7 +79,7 @@ class ActionTokenizer(nn.Module, ABC):
         return self.detokenize(tokens)
 
 
-class PerComponent(ActionTokenizer):
+class ComponentTokenizer(ActionTokenizer):
     """Tokenizers with one token per component of every action, in order, so that L is k·D."""
 
     @abstractmethod
@@ -126,7 +126,7 @@ class PerComponent(ActionTokenizer):
         return values.unflatten(dim, (-1, self.components))
 
 
-class EvenBins(PerComponent):
+class EvenBins(ComponentTokenizer):
     """Uniform grid of K bins; the outermost are centred on the bounds."""
 
     def decode(self, token: Tensor) -> Tensor:
@@ -180,7 +180,7 @@ class Uniform(EvenBins):
         target = (-0.5 * distance.square()).softmax(-1)
         return -(target * logits.log_softmax(-1)).sum(-1)
 
-    def sampled(self, tokens: Tensor, actions: Tensor) -> Tensor:
+    def sample_inputs(self, tokens: Tensor, actions: Tensor) -> Tensor:
         """Sample (…, k·D) tokens from the Gaussian target of each component."""
         position = self._position(actions).flatten(-2)
         return (position + self.smoothing * torch.randn_like(position)).round().clamp(0, self.bins - 1).long()

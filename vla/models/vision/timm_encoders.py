@@ -24,10 +24,10 @@ from vla.models.vision.image_tokenizer import FiLM, ImageEncoder
 log = logging.getLogger(__name__)
 
 WEIGHTS = "model.safetensors"  # file name of timm's weights on the hub
-Pretrained = bool | str | PackagedFile
+PretrainedSource = bool | str | PackagedFile
 
 
-def synchronised(model: nn.Module) -> nn.Module:
+def synchronize_batch_norm(model: nn.Module) -> nn.Module:
     """Convert batch normalisation to synchronised batch normalisation, and keep the activations in timm's layers."""
     from timm.layers import convert_sync_batchnorm
 
@@ -68,7 +68,7 @@ class FilmEfficientNet(ImageEncoder):
         text_width: length of the text vector.
     """
 
-    def __init__(self, name: str, pretrained: Pretrained, channels: Width, *, text_width: int) -> None:
+    def __init__(self, name: str, pretrained: PretrainedSource, channels: Width, *, text_width: int) -> None:
         super().__init__(channels)
         net = load_backbone(name, pretrained)
         if not hasattr(net, "conv_stem"):
@@ -108,7 +108,14 @@ class FilmBackbone(ImageEncoder):
     """
 
     def __init__(
-        self, name: str, pretrained: Pretrained, frozen: bool, size: Pixels | None, channels: Width, *, text_width: int
+        self,
+        name: str,
+        pretrained: PretrainedSource,
+        frozen: bool,
+        size: Pixels | None,
+        channels: Width,
+        *,
+        text_width: int,
     ) -> None:
         super().__init__(channels)
         self.backbone = load_backbone(name, pretrained, size=size)
@@ -140,7 +147,7 @@ class FilmBackbone(ImageEncoder):
         return self.film(self.projection(features), text)
 
 
-def load_backbone(name: str, pretrained: Pretrained, size: int | None = None) -> Any:
+def load_backbone(name: str, pretrained: PretrainedSource, size: int | None = None) -> Any:
     """Create a timm network without its classifier; `pretrained` as in `FilmEfficientNet`.
 
     Args:
@@ -171,12 +178,12 @@ def load_backbone(name: str, pretrained: Pretrained, size: int | None = None) ->
         raise UserError(f"{path} does not hold the weights of timm's {name}: {lines_of(error)[-1]}") from error
     del net.pretrained_cfg["state_dict"]
     origin = pretrained if isinstance(pretrained, str) and pretrained != "auto" else repository
-    net.source = Source.of(path, pretrained.source if isinstance(pretrained, PackagedFile) else origin)
+    net.source = Source.from_file(path, pretrained.source if isinstance(pretrained, PackagedFile) else origin)
     log.info("%s: weights loaded from %s", name, path)
     return net
 
 
-def _weights_file(name: str, repository: str, pretrained: Pretrained) -> Path | None:
+def _weights_file(name: str, repository: str, pretrained: PretrainedSource) -> Path | None:
     """Return the file of the initial weights, downloaded if necessary; None for random initialisation."""
     if isinstance(pretrained, PackagedFile):
         path = pretrained.locate(WEIGHTS)

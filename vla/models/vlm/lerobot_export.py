@@ -12,7 +12,7 @@ from vla.io.errors import UserError
 from vla.io.files import atomic_path, write_json
 from vla.io.types import Text
 from vla.models.trunk_folder import CONFIG
-from vla.models.vlm.network import renamed
+from vla.models.vlm.network import rename_weight
 from vla.models.vlm.normalizer import EPSILON, MODES, Normalizer
 from vla.models.vlm.policy import VisionLanguageAction
 from vla.models.vlm.trunk import IMAGES, NORMALIZER, PREPROCESSOR
@@ -51,12 +51,14 @@ class LeRobotPolicyExporter:
             raise UserError(f"LeRobot has no {type(model).__name__}: this export is for model=smolvla, pi0 and pi05")
         if model.text.name is None:
             raise UserError("LeRobot needs a tokenizer, and this policy has none: train with model.text.name=FOLDER")
-        beginnings = [(own_prefix, published_prefix) for published_prefix, own_prefix in model.network.published]
+        beginnings = [(own_prefix, published_prefix) for published_prefix, own_prefix in model.network.published_names]
         state = model.network.state_dict()
-        weights = {renamed(name, beginnings): tensor.detach().cpu().contiguous() for name, tensor in state.items()}
+        weights = {
+            rename_weight(name, beginnings): tensor.detach().cpu().contiguous() for name, tensor in state.items()
+        }
         # No action depends on these, but LeRobot's π0 and π0.5 report a failure to load if one is missing.
         shape = model.network.vocabulary, model.network.unused_width
-        weights[f"{model.network.unused[0]}weight"] = torch.zeros(shape, dtype=torch.bfloat16)
+        weights[f"{model.network.unused_names[0]}weight"] = torch.zeros(shape, dtype=torch.bfloat16)
         config, steps = _config(model), (_preprocessing(model), _postprocessing(model))
         with atomic_path(self._folder) as draft:
             draft.mkdir(parents=True)

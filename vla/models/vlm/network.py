@@ -21,7 +21,7 @@ from vla.io.types import Count, Layers, Width
 MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the time embedding
 
 Rotation = tuple[Tensor, Tensor]  # cosines and sines of positions, (B, N, H) each
-Layered = tuple[Tensor, Tensor, Tensor]  # tokens after a layer, (B, N, E), and their keys and values in it
+LayerOutput = tuple[Tensor, Tensor, Tensor]  # tokens after a layer, (B, N, E), and their keys and values in it
 
 
 class Prefix(NamedTuple):
@@ -32,20 +32,20 @@ class Prefix(NamedTuple):
     present: Tensor  # (B, P) bool, false for padding
 
 
-class Own:
+class LayerCache:
     """Keys and values of the tokens of a layer, which attend to preceding tokens too.
 
     It takes the place of a cache of transformers, but nothing is added to the preceding ones: a prefix never changes.
 
     Args:
-        others: keys and values of preceding tokens, (B, heads, P, width of a head) each.
+        past: keys and values of preceding tokens, (B, heads, P, width of a head) each.
     """
 
     keys: Tensor
     values: Tensor
 
-    def __init__(self, others: tuple[Tensor, Tensor] | None = None) -> None:
-        self._others = others
+    def __init__(self, past: tuple[Tensor, Tensor] | None = None) -> None:
+        self._others = past
 
     def update(self, keys: Tensor, values: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
         """Keep (B, heads, N, width of a head) keys and values, and return all that the tokens attend to.
@@ -58,15 +58,15 @@ class Own:
         return torch.cat([self._others[0], keys], 2), torch.cat([self._others[1], values], 2)
 
 
-class WithKeys(nn.Module):
+class KeyValueMixin(nn.Module):
     """Mixin for a layer of transformers, which makes it return keys and values beside its tokens.
 
     Left in a cache, their gradients would bypass FSDP, which gathers a layer's weights when they reach its outputs.
     """
 
-    def forward(self, hidden: Tensor, others: tuple[Tensor, Tensor] | None = None, **attention: Any) -> Layered:
+    def forward(self, hidden: Tensor, past: tuple[Tensor, Tensor] | None = None, **attention: Any) -> LayerOutput:
         """Process (B, N, E) tokens, which attend to preceding tokens too, given the keys and values of these."""
-        cache, layer = Own(others), super()
+        cache, layer = LayerCache(past), super()
         hidden = layer.forward(hidden, past_key_values=cache, **attention)
         return hidden, cache.keys, cache.values
 
@@ -81,10 +81,16 @@ class LastLayer(nn.Module):
     def __init__(self, layer: Any) -> None:
         super().__init__()
         self.input_layernorm, self.self_attn = layer.input_layernorm, layer.self_attn
-        self.self_attn.q_proj, self.self_attn.o_proj = Unused(layer.self_attn.q_proj), Unused(layer.self_attn.o_proj)
-        self.post_attention_layernorm, self.mlp = Unused(layer.post_attention_layernorm), Unused(layer.mlp)
+        self.self_attn.q_proj, self.self_attn.o_proj = (
+            UnusedWeights(layer.self_attn.q_proj),
+            UnusedWeights(layer.self_attn.o_proj),
+        )
+        self.post_attention_layernorm, self.mlp = (
+            UnusedWeights(layer.post_attention_layernorm),
+            UnusedWeights(layer.mlp),
+        )
 
-    def forward(self, hidden: Tensor, position_embeddings: Rotation, **_: Any) -> Layered:
+    def forward(self, hidden: Tensor, position_embeddings: Rotation, **_: Any) -> LayerOutput:
         """Return (B, N, E) tokens unchanged, with their keys and values."""
         normed, attention = self.input_layernorm(hidden), self.self_attn
         keys, values = (
@@ -94,7 +100,7 @@ class LastLayer(nn.Module):
         return hidden, apply_rotary_pos_emb(keys, keys, *position_embeddings)[1], values
 
 
-class Unused(nn.Module):
+class UnusedWeights(nn.Module):
     """Weights of a published policy that no action depends on, under their names and without gradients.
 
     Args:
@@ -106,19 +112,19 @@ class Unused(nn.Module):
         for name, weight in module.named_parameters(recurse=False):
             self.register_parameter(name, nn.Parameter(weight.data, requires_grad=False))
         for name, child in module.named_children():
-            self.add_module(name, Unused(child))
+            self.add_module(name, UnusedWeights(child))
 
 
-def shorten(trunk: Any, kind: type[WithKeys]) -> None:
+def shorten(trunk: Any, kind: type[KeyValueMixin]) -> None:
     """Truncate a Llama or Gemma of transformers, in place, after the keys and values of its last layer.
 
     All layers return their keys and values; `kind` is the class that does so.
     """
     return_keys(trunk, kind)
-    trunk.layers[-1], trunk.norm = LastLayer(trunk.layers[-1]), Unused(trunk.norm)
+    trunk.layers[-1], trunk.norm = LastLayer(trunk.layers[-1]), UnusedWeights(trunk.norm)
 
 
-def return_keys(network: Any, kind: type[WithKeys]) -> None:
+def return_keys(network: Any, kind: type[KeyValueMixin]) -> None:
     """Make the layers of a Llama or Gemma of transformers instances of `kind`, in place."""
     for layer in network.layers:
         layer.__class__ = kind
@@ -147,10 +153,10 @@ class FlowNetwork(nn.Module, ABC):
 
     # Names of weights in a whole policy of LeRobot, and in the vision-language model alone: pairs of how they begin
     # there and here. The first match counts.
-    published: ClassVar[tuple[tuple[str, str], ...]] = ()
-    pretrained: ClassVar[tuple[tuple[str, str], ...]] = ()
+    published_names: ClassVar[tuple[tuple[str, str], ...]] = ()
+    trunk_names: ClassVar[tuple[tuple[str, str], ...]] = ()
     # Beginnings of the published names of a language-model head, which no action depends on; LeRobot's comes first.
-    unused: ClassVar[tuple[str, ...]] = ()
+    unused_names: ClassVar[tuple[str, ...]] = ()
 
     kind: ClassVar[str] = ""  # LeRobot's name of the policy
     causal: ClassVar[bool] = False  # whether actions never attend to later ones
@@ -189,7 +195,7 @@ class FlowNetwork(nn.Module, ABC):
         self.text = {"vocab_size": vocabulary, **sizes(width, feedforward)}
         self.vision = {"num_hidden_layers": vision_layers, "num_attention_heads": vision_heads, "patch_size": patch}
         self.vision |= {"image_size": resolution, **sizes(vision_width, vision_feedforward)}
-        self.of_expert = sizes(expert_width, expert_feedforward)
+        self.expert_sizes = sizes(expert_width, expert_feedforward)
 
     def options(self) -> dict[str, Any]:
         """Return the options by which LeRobot describes this network, where they differ from its defaults."""
@@ -215,7 +221,7 @@ class FlowNetwork(nn.Module, ABC):
         """
 
 
-def renamed(name: str, beginnings: Iterable[tuple[str, str]]) -> str:
+def rename_weight(name: str, beginnings: Iterable[tuple[str, str]]) -> str:
     """Return a published name as it is here, given pairs of how names begin there and here."""
     for published_prefix, own_prefix in beginnings:
         if name.startswith(published_prefix):

@@ -16,10 +16,12 @@ from transformers.activations import GELUTanh
 from transformers.models.siglip.modeling_siglip import SiglipMLP
 from transformers.models.smolvlm.modeling_smolvlm import SmolVLMVisionMLP
 
-Packed = tuple[tuple[int, int], Tensor]  # address and version of a weight, and the weight in another layout
-PACKED: WeakKeyDictionary[nn.Module, Packed] = WeakKeyDictionary()  # not in the modules, which are saved and copied
+PackedWeight = tuple[tuple[int, int], Tensor]  # address and version of a weight, and the weight in another layout
+PACKED_WEIGHTS: WeakKeyDictionary[nn.Module, PackedWeight] = (
+    WeakKeyDictionary()
+)  # not in the modules, which are saved and copied
 # Fused optimisers change a weight without changing its version.
-register_optimizer_step_post_hook(lambda *_: PACKED.clear())
+register_optimizer_step_post_hook(lambda *_: PACKED_WEIGHTS.clear())
 
 
 class PackedLinear(nn.Linear):
@@ -43,10 +45,10 @@ class PackedLinear(nn.Linear):
 
     def _forward_packed(self, input: Tensor, activation: str, approximation: str) -> Tensor:
         key = self.weight.data_ptr(), self.weight._version
-        entry = PACKED.get(self)
+        entry = PACKED_WEIGHTS.get(self)
         if entry is None or entry[0] != key:
             rows = input.numel() // self.in_features
-            entry = PACKED[self] = key, torch.ops.mkldnn._reorder_linear_weight(self.weight.detach(), rows)
+            entry = PACKED_WEIGHTS[self] = key, torch.ops.mkldnn._reorder_linear_weight(self.weight.detach(), rows)
         return torch.ops.mkldnn._linear_pointwise(input, entry[1], self.bias, activation, [], approximation)
 
 

@@ -18,7 +18,7 @@ from transformers import GemmaConfig, GemmaModel, PaliGemmaConfig, PaliGemmaMode
 from transformers.models.gemma.modeling_gemma import GemmaDecoderLayer
 
 from vla.io.types import Inherited
-from vla.models.vlm.network import FlowNetwork, Prefix, WithKeys, return_keys, shorten
+from vla.models.vlm.network import FlowNetwork, KeyValueMixin, Prefix, return_keys, shorten
 
 NAMES = (  # of weights, published and here
     ("paligemma_with_expert.paligemma.lm_head.", "paligemma.language_model.embed_tokens."),  # one matrix is both
@@ -35,7 +35,7 @@ TRUNK = (  # the same of PaliGemma alone
 HEADS = ("model.", "")  # of published names: what LeRobot saves begins with the former, what openpi saves does not
 
 
-class GemmaLayer(WithKeys, GemmaDecoderLayer):
+class GemmaLayer(KeyValueMixin, GemmaDecoderLayer):
     """A layer of Gemma."""
 
 
@@ -45,16 +45,16 @@ class PaliGemmaWithExpert(FlowNetwork):
     All query heads share one key-value head, and every patch becomes a token.
     """
 
-    published = tuple((f"{head}{prefix}", own_prefix) for head in HEADS for prefix, own_prefix in NAMES)
-    pretrained = TRUNK
-    unused = tuple(f"{head}paligemma_with_expert.gemma_expert.lm_head." for head in HEADS)
+    published_names = tuple((f"{head}{prefix}", own_prefix) for head in HEADS for prefix, own_prefix in NAMES)
+    trunk_names = TRUNK
+    unused_names = tuple(f"{head}paligemma_with_expert.gemma_expert.lm_head." for head in HEADS)
 
     def __init__(self, **inherited: Inherited) -> None:
         super().__init__(**inherited)
         self.state_width, self.value_width, self.unused_width = 0, self.head_width, self.expert_width
         shared = {**self.shared, "num_key_value_heads": 1}
         self.paligemma = _trunk({**shared, **self.text}, self.vision)
-        self.expert = _expert({**shared, **self.of_expert})
+        self.expert = _expert({**shared, **self.expert_sizes})
         self.action_in_proj = nn.Linear(self.action_width, self.expert_width)
         self.action_out_proj = nn.Linear(self.expert_width, self.action_width)
 
@@ -92,7 +92,7 @@ class PaliGemmaWithExpert(FlowNetwork):
         keys, values = [], []
         for number, layer in enumerate(gemma.layers):
             pair = None if prefix is None else (prefix.keys[number], prefix.values[number])
-            attention = {"attention_mask": mask, "position_embeddings": rotation, "others": pair}
+            attention = {"attention_mask": mask, "position_embeddings": rotation, "past": pair}
             hidden, own_keys, own_values = layer(hidden, **attention, **condition)
             keys.append(own_keys)
             values.append(own_values)
@@ -119,7 +119,7 @@ def _expert(sizes: dict[str, int]) -> GemmaModel:
     return expert
 
 
-def joined(first: Prefix, second: Prefix) -> Prefix:
+def concatenate_prefixes(first: Prefix, second: Prefix) -> Prefix:
     """Concatenate two prefixes."""
     keys, values = (
         tuple(torch.cat(pair, 2) for pair in zip(*layers, strict=True))

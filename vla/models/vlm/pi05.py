@@ -14,7 +14,7 @@ from transformers import GemmaConfig
 from transformers.models.gemma.modeling_gemma import GemmaAttention, GemmaMLP
 
 from vla.io.types import Inherited
-from vla.models.vlm.network import Layered, Own, Prefix, time_embedding
+from vla.models.vlm.network import LayerCache, LayerOutput, Prefix, time_embedding
 from vla.models.vlm.paligemma import PaliGemmaWithExpert
 
 
@@ -84,10 +84,10 @@ class AdaptiveLayer(nn.Module):
         self.post_attention_layernorm = AdaptiveNorm(config.hidden_size, config.rms_norm_eps)
 
     def forward(
-        self, hidden: Tensor, condition: Tensor, others: tuple[Tensor, Tensor] | None, **attention: Any
-    ) -> Layered:
+        self, hidden: Tensor, condition: Tensor, past: tuple[Tensor, Tensor] | None, **attention: Any
+    ) -> LayerOutput:
         """Process (B, N, E) tokens, given the condition of the norms, and keys and values of preceding tokens."""
-        cache = Own(others)
+        cache = LayerCache(past)
         normal, gate = self.input_layernorm(hidden, condition)
         hidden = hidden + self.self_attn(normal, past_key_values=cache, **attention)[0] * gate
         normal, gate = self.post_attention_layernorm(hidden, condition)

@@ -21,7 +21,7 @@ from torch import Tensor
 from vla.io.errors import UserError
 from vla.io.types import Natural, NonNegative, Shift, Steps, Text
 from vla.models.chunking import after_prefix, require_prefix, with_prefix
-from vla.models.layers import Batch, mean_where, newest, random_arguments
+from vla.models.layers import Batch, mean_where, newest_index, random_arguments
 from vla.models.model import Model, Prediction
 from vla.models.tokenizers.tokenizer import ActionTokenizer
 from vla.models.vlm.network import FlowNetwork, Prefix
@@ -131,7 +131,7 @@ class VisionLanguageAction(Model):
             self.state_normalizer.fit(states[:, self.spec.pose], constant=1.0)
             self.action_normalizer.fit(actions)
 
-    def known(self, batch: Batch) -> Prefix:
+    def encode_prefix(self, batch: Batch) -> Prefix:
         """Encode the newest frame and the sentence."""
         images = torch.stack([self.image(batch["rgb"][camera][:, -1]) for camera in self.cameras], 1)
         present = images.new_ones(images.shape[:2], dtype=torch.bool)
@@ -147,7 +147,7 @@ class VisionLanguageAction(Model):
         x = resize_with_padding(image.permute(0, 3, 1, 2).float() / 255, size, self.place)
         return 2 * x - 1
 
-    def noised(self, batch: Batch) -> Batch:
+    def with_noise(self, batch: Batch) -> Batch:
         """Return a batch with "noise", (R·B, k, A), and "time" and "length" of the given actions, (R·B,) each.
 
         Outside training they have a fixed seed.
@@ -161,13 +161,13 @@ class VisionLanguageAction(Model):
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
         """Return the scalar `loss` at the noise and times of the batch, or at random ones, and its parts by name."""
-        return super().loss(batch if "time" in batch else self.noised(batch))
+        return super().loss(batch if "time" in batch else self.with_noise(batch))
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
         """Return velocity and target, (R·B, k, A) each; with an auxiliary head also truth: (B, 1, S), normalised."""
         copies = len(batch["time"]) // len(batch["state"])
-        prefix = self.known(batch)
-        prefixes = repeated(prefix, copies)
+        prefix = self.encode_prefix(batch)
+        prefixes = repeat_prefix(prefix, copies)
         action = self.scaled(batch["action"][:, -1]).repeat(copies, 1, 1)
         noise, time = batch["noise"], batch["time"]
         noisy = time[:, None, None] * noise + (1 - time)[:, None, None] * action
@@ -175,7 +175,7 @@ class VisionLanguageAction(Model):
             executed = self.scaled(batch["executed"][:, -1]).repeat(copies, 1, 1)
             noisy, progress = with_prefix(noisy, 1 - time, executed, batch["length"])
             time = 1 - progress
-        truth = self.predict_truth(last_of(prefix).unsqueeze(1))
+        truth = self.predict_truth(last_values(prefix).unsqueeze(1))
         return {"velocity": self.network.velocity(prefixes, noisy, time), "target": noise - action, **truth}
 
     def scaled(self, action: Tensor) -> Tensor:
@@ -199,19 +199,19 @@ class VisionLanguageAction(Model):
 
     def predict(self, batch: Batch) -> Prediction:
         """Transport the "noise" of the batch, or else a fixed noise, to actions."""
-        prefix = self.known(batch)
+        prefix = self.encode_prefix(batch)
         noise = batch["noise"] if "noise" in batch else self.noise.expand(len(prefix.present), -1, -1)
-        velocity = self.continued(lambda x, progress: -self.network.velocity(prefix, x, 1 - progress), batch)
+        velocity = self.continuing_velocity(lambda x, progress: -self.network.velocity(prefix, x, 1 - progress), batch)
         x = noise
         for step in range(self.steps):
             x = x + velocity(x, x.new_full((len(x),), step / self.steps)) / self.steps
         return Prediction(self.action_normalizer.inverse(x[..., : len(self.spec.action)]))
 
 
-def last_of(known: Prefix) -> Tensor:
+def last_values(prefix: Prefix) -> Tensor:
     """Return the last layer's values of the last token, before any padding, of every prefix, (B, `value_width`)."""
-    indices = newest(known.present)
-    return known.values[-1][torch.arange(len(indices), device=indices.device), :, indices].flatten(1)
+    indices = newest_index(prefix.present)
+    return prefix.values[-1][torch.arange(len(indices), device=indices.device), :, indices].flatten(1)
 
 
 def resize_with_padding(images: Tensor, size: int, place: Place) -> Tensor:
@@ -227,7 +227,7 @@ def resize_with_padding(images: Tensor, size: int, place: Place) -> Tensor:
     return F.pad(x, (left, size - columns - left, top, size - rows - top))
 
 
-def repeated(prefix: Prefix, copies: int) -> Prefix:
+def repeat_prefix(prefix: Prefix, copies: int) -> Prefix:
     """Repeat the rows of a prefix `copies` times."""
     if copies == 1:
         return prefix

@@ -26,7 +26,7 @@ FILE = "tokenizer.json"
 WORDS = 4096  # hashes of words, where no tokenizer is named
 STEP = 16  # lengths are multiples of it [tokens]: few, so that a program compiled for each can be kept
 BINS = 256  # of a normalised state in -1 … 1
-TRIED = "Task: pick it up, State: -1 0 255;\nAction: "
+SAMPLE_PROMPT = "Task: pick it up, State: -1 0 255;\nAction: "
 
 
 class Prompt(TextEncoder):
@@ -61,9 +61,10 @@ class Prompt(TextEncoder):
             self.register_buffer("end", torch.tensor(self._ids(";\nAction: ", special=False)), persistent=False)
             tried_ids = self._ids("Task: pick it up, State:", special=True)
             tried_ids = tried_ids + number_ids[0] + number_ids[1] + number_ids[-1] + self.end.tolist()
-            if tried_ids != self._ids(TRIED, special=True):
+            if tried_ids != self._ids(SAMPLE_PROMPT, special=True):
                 raise UserError(
-                    f"the tokenizer of {name} does not read numbers one by one, as {TRIED!r} needs: choose another one"
+                    f"the tokenizer of {name} does not read numbers one by one, as {SAMPLE_PROMPT!r} needs: "
+                    "choose another one"
                 )
 
     def tokenize(self, sentences: list[str]) -> Tensor:

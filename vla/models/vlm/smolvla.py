@@ -21,7 +21,16 @@ from transformers.models.llama.modeling_llama import LlamaAttention, LlamaDecode
 from vla.io.errors import UserError
 from vla.io.types import Count, Inherited, Layers, Natural, Width
 from vla.models.vision.image_tokenizer import ImageEncoder, Keypoints
-from vla.models.vlm.network import FlowNetwork, Prefix, Rotation, WithKeys, require_multiple, shorten, sizes, with_time
+from vla.models.vlm.network import (
+    FlowNetwork,
+    KeyValueMixin,
+    Prefix,
+    Rotation,
+    require_multiple,
+    shorten,
+    sizes,
+    with_time,
+)
 
 ROPE_BASE = 10_000.0  # of the policy, whatever that of the language model was
 EPSILON = 1e-5  # of RMS norms
@@ -50,13 +59,13 @@ class SmolVLA(FlowNetwork):
 
     kind = "smolvla"
     causal = True
-    published = (
+    published_names = (
         ("model.vlm_with_expert.vlm.model.", "vlm."),
         ("model.vlm_with_expert.lm_expert.", "expert."),
         ("model.", ""),
     )
-    pretrained = (("model.", "vlm."),)
-    unused = ("model.vlm_with_expert.vlm.lm_head.",)
+    trunk_names = (("model.", "vlm."),)
+    unused_names = ("model.vlm_with_expert.vlm.lm_head.",)
 
     def __init__(
         self,
@@ -82,7 +91,7 @@ class SmolVLA(FlowNetwork):
             self.keypoints = KeypointTokens(image, keypoints, self.width)
             nn.init.normal_(self.vlm.text_model.embed_tokens.weight, std=self.width**-0.5)  # scale of keypoint tokens
             del self.vlm.vision_model, self.vlm.connector
-        self.expert = _expert(shared, joint_every, **self.of_expert)
+        self.expert = _expert(shared, joint_every, **self.expert_sizes)
         self.state_proj = nn.Linear(state_width, self.width)
         self.action_in_proj = nn.Linear(self.action_width, self.expert_width)
         self.action_out_proj = nn.Linear(self.expert_width, self.action_width)
@@ -171,7 +180,7 @@ class KeypointTokens(nn.Module):
         return self.tokens(self.keypoints(features)) + self.number
 
 
-class TrunkLayer(WithKeys, LlamaDecoderLayer):
+class TrunkLayer(KeyValueMixin, LlamaDecoderLayer):
     """A layer of the trunk."""
 
 

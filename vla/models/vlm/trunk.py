@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from vla.io.documents import parse_plain, read_json
 from vla.io.errors import UserError
 from vla.models.trunk import Source
-from vla.models.trunk_folder import CONFIG, WEIGHTS, opened, trunk_folder
+from vla.models.trunk_folder import CONFIG, WEIGHTS, open_safetensors, trunk_folder
 from vla.models.vision.image_tokenizer import ImageEncoder
-from vla.models.vlm.network import MAX_PERIOD, MIN_PERIOD, FlowNetwork, renamed
+from vla.models.vlm.network import MAX_PERIOD, MIN_PERIOD, FlowNetwork, rename_weight
 from vla.models.vlm.normalizer import MODES, Kind
 from vla.parallel.limits import free_memory
 
@@ -67,7 +67,7 @@ class Trunk:
     @property
     def source(self) -> Source:
         """What identifies the weights."""
-        sources = [Source.of(path, self.name) for path in self._files]
+        sources = [Source.from_file(path, self.name) for path in self._files]
         digests = b"".join(bytes.fromhex(source.sha256) for source in sources)
         size = sum(source.size for source in sources)
         return Source(self.name, sources[0].revision, hashlib.sha256(digests).hexdigest(), size)
@@ -116,15 +116,15 @@ class Trunk:
         parameters = dict(instance.named_parameters())
         weights = dict[str, Tensor]()
         for key, tensor in _tensors(self._files):
-            name = renamed(key, instance.published if self.is_policy else instance.pretrained)
+            name = rename_weight(key, instance.published_names if self.is_policy else instance.trunk_names)
             if name in parameters:
                 if tensor.shape != parameters[name].shape:
                     shapes = f"{[*tensor.shape]}, and the model has {[*parameters[name].shape]}"
                     raise UserError(f"{key} in {self} has shape {shapes}: choose another model= or model.network")
                 weights[name] = tensor.to(torch.float32, copy=True)
-            elif self.is_policy and not key.startswith(instance.unused):
+            elif self.is_policy and not key.startswith(instance.unused_names):
                 raise UserError(f"{self} has {key}, which the model lacks: choose another model= or model.network")
-        prefixes = ("",) if self.is_policy else tuple(prefix for _, prefix in instance.pretrained)
+        prefixes = ("",) if self.is_policy else tuple(prefix for _, prefix in instance.trunk_names)
         if missing_names := [name for name in parameters if name not in weights and name.startswith(prefixes)]:
             suffix = ", …" if len(missing_names) > 1 else ""
             raise UserError(f"{self} lacks weights of the model: {missing_names[0]}{suffix}")
@@ -182,7 +182,7 @@ def _initialize(network: nn.Module, name: str, module: nn.Module) -> None:
 def _tensors(paths: list[Path]) -> Iterator[tuple[str, Tensor]]:
     """Yield the name and the tensor of every weight in the files; a UserError if a file is damaged."""
     for path in paths:
-        with opened(path) as file:
+        with open_safetensors(path) as file:
             names: list[str] = file.keys()  # it is no mapping
             for name in names:
                 yield name, file.get_tensor(name)

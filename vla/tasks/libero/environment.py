@@ -18,7 +18,7 @@ from vla.tasks.libero.package import ALL, STATES, Task, folders, suites_of, task
 from vla.tasks.libero.scene import BURNER, VISIBLE, Detail, load_scene
 from vla.tasks.libero.starts import Randomize, Starts, set_start
 from vla.tasks.rendering.renderer import LazyRenderer, RendererFactory, Views
-from vla.tasks.world import ManyTasks
+from vla.tasks.world import MultitaskWorld
 
 CONTROL_HZ = 20.0
 STATE = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z", "finger_1", "finger_2")
@@ -36,7 +36,7 @@ TINT = 0.2, 1.0  # range of the factors of red, green and blue
 Numbers = Annotated[list[Annotated[int, Ge(0), Le(9)]], MinLen(1), Predicate(unique)]
 
 
-class Libero(ManyTasks):
+class Libero(MultitaskWorld):
     """Tasks of a Panda on a table, a floor or in a kitchen, one of them per episode: seeds cycle through them.
 
     An episode ends at the first step that LIBERO counts as a success, or when its steps are used up. The state is the
@@ -117,13 +117,13 @@ class Libero(ManyTasks):
         task = self._task = self._tasks[number]
         self.task, self.done, self.outcome, self._steps_taken = task.name, False, "timeout", 0
         scene = self._scene = self._scene_of(task.scene, lambda: Scene(task, self._renderer, self.spec, self._detail))
-        starts, self._goal = scene.started(task)
+        starts, self._goal = scene.starts_and_goal(task)
         state = (seed - FIRST_SEED) // len(self._tasks) % STATES if FIRST_SEED <= seed < END else None
         # One generator each, so that changing a share does not change the other draws.
         random, places, colours = (np.random.default_rng(key) for key in (seed, [seed, 4], [seed, 5]))
         exchanged = state is None and places.random() < self._randomize.places
         coloured = state is None and colours.random() < self._randomize.colours
-        start = starts.drawn(random, exchanged) if state is None else starts.official(state)
+        start = starts.draw(random, exchanged) if state is None else starts.official(state)
         self.draws = {
             "start": {"official": -1 if state is None else state, "exchanged": exchanged, "coloured": coloured}
         }
@@ -139,7 +139,7 @@ class Libero(ManyTasks):
         self._require_running()
         self._scene.controller.step(self._scene.data, command_of(np.clip(action, self.spec.low, self.spec.high)))
         self._steps_taken += 1
-        if self._goal.reached(self._scene.data):
+        if self._goal.is_reached(self._scene.data):
             self.outcome = "success"
         self.done = self.outcome == "success" or self._steps_taken == self._limits[self._task.suite.partition("_")[0]]
         return self._look()
@@ -147,7 +147,7 @@ class Libero(ManyTasks):
     def _look(self) -> Observation:
         scene = self._scene
         pictures = () if self._blind else scene.pictures(self._mirror)
-        subgoal = (*self._goal.todo(scene.data), *self._goal.parts)[0]  # what is to be done next
+        subgoal = (*self._goal.unmet_predicates(scene.data), *self._goal.parts)[0]  # what is to be done next
         truth = {
             "object": scene.position(subgoal.thing),
             "goal": scene.position(subgoal.place or subgoal.thing),
@@ -196,7 +196,7 @@ class Scene:
         address = model.joint("gripper0_finger_joint1").qposadr[0]
         self._fingers = slice(address, address + 2)
 
-    def started(self, task: Task) -> tuple[Starts, Goal]:
+    def starts_and_goal(self, task: Task) -> tuple[Starts, Goal]:
         """Return starts and goal of one of the tasks in this scene."""
         if task.name not in self._starts:
             self._starts[task.name] = Starts(self.model, task), Goal(self.model, task.goal)

@@ -16,7 +16,7 @@ from vla.tasks.libero.environment import STATE, action_of
 from vla.tasks.libero.goal import CABINET
 from vla.tasks.libero.grasps import choose_grasp, room_of
 from vla.tasks.libero.package import ALL, tasks_of
-from vla.tasks.libero.places import in_the_way, place_of
+from vla.tasks.libero.places import place_of, way_off_drawer_path
 from vla.tasks.libero.situation import HELD, THIN, Situation
 from vla.tasks.libero.skills import TWIST, approach, carry, command, drag, let_go, pull, push, twist, withdraw
 
@@ -58,61 +58,72 @@ class Planner:
         return action_of(decide(situation))
 
 
-def decide(at: Situation) -> Array:
+def decide(situation: Situation) -> Array:
     """Return the command (7,) for a state."""
-    todo, touched_thing = at.goal.todo(at.data), at.touched()
-    held_thing = touched_thing if at.opening < HELD and at.gap > THIN else None
+    todo, touched_thing = situation.goal.unmet_predicates(situation.data), situation.grasped_thing()
+    held_thing = touched_thing if situation.opening < HELD and situation.gap > THIN else None
     if not todo:
-        return _open_fingers(at)
-    if touched_thing is not None and all(at.subject(part.thing) != touched_thing for part in todo):
-        return _release(at, held_thing)
+        return _open_fingers(situation)
+    if touched_thing is not None and all(situation.subject(part.thing) != touched_thing for part in todo):
+        return _release(situation, held_thing)
     name, thing, place = next((part for part in todo if part.thing == held_thing), todo[0])
-    if name in ("on", "in") and _is_shut(at, place, SLIPPED if thing == held_thing else 0.0):
+    if name in ("on", "in") and _is_shut(situation, place, SLIPPED if thing == held_thing else 0.0):
         if thing == held_thing:  # the hand is needed to open the drawer
-            return _open_fingers(at)
-        displacement = in_the_way(at, thing, int(at.goal.joints(place)[0]))
-        return pull(at, place) if displacement is None or not at.upright else drag(at, thing, displacement)
+            return _open_fingers(situation)
+        displacement = way_off_drawer_path(situation, thing, int(situation.goal.joints(place)[0]))
+        return (
+            pull(situation, place)
+            if displacement is None or not situation.upright
+            else drag(situation, thing, displacement)
+        )
     if name == "open":
-        return pull(at, thing)
-    if not at.upright:
-        return withdraw(at)
+        return pull(situation, thing)
+    if not situation.upright:
+        return withdraw(situation)
     if name in ("turnon", "turnoff"):
-        return twist(at, thing, TWIST if name == "turnon" else -TWIST)
+        return twist(situation, thing, TWIST if name == "turnon" else -TWIST)
     if name == "close":
-        return push(at, thing)
-    return _deliver(at, thing, place, thing == held_thing)
+        return push(situation, thing)
+    return _deliver(situation, thing, place, thing == held_thing)
 
 
-def _open_fingers(at: Situation) -> Array:
-    return command(at, at.hand, at.yaw, -1.0, at.lean)
+def _open_fingers(situation: Situation) -> Array:
+    return command(situation, situation.hand, situation.yaw, -1.0, situation.lean)
 
 
-def _release(at: Situation, thing: str | None) -> Array:
+def _release(situation: Situation, thing: str | None) -> Array:
     """Let go of a thing that needs nothing more, once it lies where the goal requires it."""
-    predicate = next((part for part in at.goal.parts if part.thing == thing), None)
-    if predicate is not None and predicate.name == "in" and at.subject(predicate.place).startswith(HOLLOWS):
-        place = place_of(at, predicate.thing, predicate.place, True)
-        if np.linalg.norm(place.spot - at.origin(predicate.thing)) > ARRIVED:
-            return carry(at, predicate.thing, place)  # it counts as there, but it is not down or not far enough in yet
-    return let_go(at, predicate.thing) if predicate is not None and predicate.name == "on" else _open_fingers(at)
+    predicate = next((part for part in situation.goal.parts if part.thing == thing), None)
+    if predicate is not None and predicate.name == "in" and situation.subject(predicate.place).startswith(HOLLOWS):
+        place = place_of(situation, predicate.thing, predicate.place, True)
+        if np.linalg.norm(place.spot - situation.origin(predicate.thing)) > ARRIVED:
+            # It counts as there, but it is not down or not far enough in yet.
+            return carry(situation, predicate.thing, place)
+    return (
+        let_go(situation, predicate.thing)
+        if predicate is not None and predicate.name == "on"
+        else _open_fingers(situation)
+    )
 
 
-def _deliver(at: Situation, thing: str, destination: str, held: bool) -> Array:
+def _deliver(situation: Situation, thing: str, destination: str, held: bool) -> Array:
     """Bring a thing to where it is to be."""
-    place = place_of(at, thing, destination, held)
+    place = place_of(situation, thing, destination, held)
     if held:
-        return carry(at, thing, place)
-    grasp = choose_grasp(at, thing, place)
-    if place.hidden is not None and (grasp is None or room_of(at, thing, grasp) < NARROW):
-        return drag(at, thing, place.hidden)
+        return carry(situation, thing, place)
+    grasp = choose_grasp(situation, thing, place)
+    if place.current_exit is not None and (grasp is None or room_of(situation, thing, grasp) < NARROW):
+        return drag(situation, thing, place.current_exit)
     if grasp is None:
-        return drag(at, thing, (place.spot - at.origin(thing)) * (1, 1, 0))
-    return approach(at, grasp, at.points(thing), thing)
+        return drag(situation, thing, (place.spot - situation.origin(thing)) * (1, 1, 0))
+    return approach(situation, grasp, situation.points(thing), thing)
 
 
-def _is_shut(at: Situation, place: str, slack: float) -> bool:
+def _is_shut(situation: Situation, place: str, slack: float) -> bool:
     """Return whether a place is in a drawer that must be opened first; it may lack `slack` [m] of being open."""
-    if place in at.goal.bodies or not at.subject(place).startswith(DRAWERS):
+    if place in situation.goal.bodies or not situation.subject(place).startswith(DRAWERS):
         return False
-    joints = at.goal.joints(place)
-    return bool(len(joints)) and not (at.data.qpos[at.model.jnt_qposadr[joints]] < CABINET[0] + slack).any()
+    joints = situation.goal.joints(place)
+    return (
+        bool(len(joints)) and not (situation.data.qpos[situation.model.jnt_qposadr[joints]] < CABINET[0] + slack).any()
+    )

@@ -47,11 +47,11 @@ class Goal:
             is_main = names[number].endswith("_main")
             self.owner[number] = number if is_main else self.owner[model.body_parentid[number]]
 
-    def reached(self, data: mujoco.MjData) -> bool:
+    def is_reached(self, data: mujoco.MjData) -> bool:
         """Return whether all predicates hold."""
         return all(self.holds(data, *part) for part in self.parts)
 
-    def todo(self, data: mujoco.MjData) -> list[Predicate]:
+    def unmet_predicates(self, data: mujoco.MjData) -> list[Predicate]:
         """Return the predicates that do not hold, in an order in which they can be fulfilled."""
         return [part for part in self.parts if not self.holds(data, *part)]
 
@@ -80,14 +80,14 @@ class Goal:
         if place in self.bodies:
             support = self.bodies[place]
             gap = data.xpos[body] - data.xpos[support]
-            return bool(gap[2] >= 0 and np.hypot(*gap[:2]) < NEAR) and self.touch(data, body, support)
+            return bool(gap[2] >= 0 and np.hypot(*gap[:2]) < NEAR) and self.are_touching(data, body, support)
         site = self.sites[place]
         size = self._model.site_size[site]
         # Like LIBERO, which multiplies by the site's matrix where its transpose was meant.
         gap = data.site_xmat[site].reshape(3, 3) @ (data.xpos[body] - data.site_xpos[site])
         is_over = size[2] + OVER[0] < gap[2] < size[2] + OVER[1] and bool((np.abs(gap[:2]) < size[:2]).all())
         owner = self.owner[self._model.site_bodyid[site]]  # 0: a part of the table, which needs no touch
-        return is_over and (owner == 0 or self.touch(data, body, owner))
+        return is_over and (owner == 0 or self.are_touching(data, body, owner))
 
     def _is_in(self, data: mujoco.MjData, body: int, place: str) -> bool:
         """Return whether the body's origin is in the region, even if the gripper holds it."""
@@ -96,7 +96,7 @@ class Goal:
         gap = data.xpos[body] - data.site_xpos[site]
         return bool((gap < size).all() and (gap > -size - np.array([0, 0, SLACK])).all())
 
-    def touch(self, data: mujoco.MjData, one: int, other: int) -> bool:
+    def are_touching(self, data: mujoco.MjData, first: int, second: int) -> bool:
         """Return whether two things, by their bodies, are in contact."""
         pairs = self.owner[self._model.geom_bodyid[data.contact.geom[: data.ncon]]]
-        return bool((np.sort(pairs, axis=1) == sorted((one, other))).all(axis=1).any())
+        return bool((np.sort(pairs, axis=1) == sorted((first, second))).all(axis=1).any())

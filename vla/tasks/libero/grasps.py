@@ -11,7 +11,7 @@ import numpy as np
 from vla.robots.cartesian import rotation_z
 from vla.spec import Array
 from vla.tasks.libero.places import Place
-from vla.tasks.libero.room import CLEAR, HAND, PALM, TIP, axes, clearance, far
+from vla.tasks.libero.room import CLEAR, HAND, PALM, TIP, axes, clearance, reach_costs
 from vla.tasks.libero.situation import THIN, Situation
 
 WIDEST = 0.074  # of a thing between the open fingers [m]
@@ -36,11 +36,16 @@ class Grasp:
     lean: float = 0.0  # of the hand about the axis along which the fingers close [rad]
 
 
-def choose_grasp(at: Situation, thing: str, place: Place) -> Grasp | None:
+def choose_grasp(situation: Situation, thing: str, place: Place) -> Grasp | None:
     """Return the cheapest grasp from above of a thing to be brought to a place; None if there is none."""
-    points = at.points(thing)
-    is_tilted = np.abs(at.data.xmat[at.goal.bodies[thing], 6:]).max() < UPRIGHT  # whichever of its axes is up
-    kinds = (crest(points),) if is_tilted else (across(points), walls(points), parts(at.pieces(thing)), leaning(points))
+    points = situation.points(thing)
+    # Whichever of its axes is up.
+    is_tilted = np.abs(situation.data.xmat[situation.goal.bodies[thing], 6:]).max() < UPRIGHT
+    kinds = (
+        (crest(points),)
+        if is_tilted
+        else (grasps_across(points), walls(points), parts(situation.pieces(thing)), leaning_grasps(points))
+    )
     best_grasp: Grasp | None = None
     lowest_cost = hindrance = math.inf  # cost of the best one, and the part of it that is due to its kind and obstacles
     for base_cost, kind in zip(KINDS, kinds, strict=False):
@@ -49,7 +54,7 @@ def choose_grasp(at: Situation, thing: str, place: Place) -> Grasp | None:
         if not (candidates := [(width, grasp) for width, grasp in kind if gap_of(grasp, points) > 0]):
             continue
         widths, grasps = zip(*candidates, strict=True)
-        moves, hindrances = _costs(at, thing, grasps, place)
+        moves, hindrances = _costs(situation, thing, grasps, place)
         costs = base_cost + np.array(widths) + moves + hindrances
         index = int(np.argmin(costs))
         if costs[index] < lowest_cost:
@@ -58,36 +63,36 @@ def choose_grasp(at: Situation, thing: str, place: Place) -> Grasp | None:
     return best_grasp
 
 
-def room_of(at: Situation, thing: str, grasp: Grasp) -> float:
+def room_of(situation: Situation, thing: str, grasp: Grasp) -> float:
     """Return the free room about the hand at a grasp [m]."""
-    obstacles = at.others(thing, grasp.position, 2 * HAND)
+    obstacles = situation.surroundings(thing, grasp.position, 2 * HAND)
     return float(clearance(grasp.position[None], np.array([grasp.yaw]), obstacles, np.array([grasp.lean]))[0])
 
 
-def _costs(at: Situation, thing: str, grasps: Sequence[Grasp], place: Place) -> tuple[Array, Array]:
+def _costs(situation: Situation, thing: str, grasps: Sequence[Grasp], place: Place) -> tuple[Array, Array]:
     """Return costs (K,) of the motion of the hand, and of what hinders it where it grasps and where it lets go."""
     spots = np.array([grasp.position for grasp in grasps])
     yaws, leans = np.array([grasp.yaw for grasp in grasps]), np.array([grasp.lean for grasp in grasps])
-    targets = place.spot + (spots - at.origin(thing)) @ rotation_z(place.turn).T
-    turns = np.array([at.turn_to(yaw) for yaw in yaws])
+    targets = place.spot + (spots - situation.origin(thing)) @ rotation_z(place.turn).T
+    turns = np.array([situation.turn_to(yaw) for yaw in yaws])
     # What is near the hand costs less: the choice stays the same while the hand approaches.
-    distance = np.minimum(np.linalg.norm(spots[:, :2] - at.hand[:2], axis=1), HAND)
-    moves = 0.02 * np.abs(turns) + 0.02 * np.abs(leans - at.lean) + 0.5 * distance + 0.01 * np.abs(yaws)
-    releases = _hindrances(at, thing, targets, yaws + place.turn, leans)
-    if place.out is None:
+    distance = np.minimum(np.linalg.norm(spots[:, :2] - situation.hand[:2], axis=1), HAND)
+    moves = 0.02 * np.abs(turns) + 0.02 * np.abs(leans - situation.lean) + 0.5 * distance + 0.01 * np.abs(yaws)
+    releases = _hindrances(situation, thing, targets, yaws + place.turn, leans)
+    if place.exit is None:
         releases -= releases.min()  # a basket's walls are close to every hand, and things may fall the last centimetres
-    return moves, _hindrances(at, thing, spots, yaws, leans) + releases
+    return moves, _hindrances(situation, thing, spots, yaws, leans) + releases
 
 
-def _hindrances(at: Situation, thing: str, spots: Array, yaws: Array, leans: Array) -> Array:
+def _hindrances(situation: Situation, thing: str, spots: Array, yaws: Array, leans: Array) -> Array:
     """Return costs (K,) of obstacles close to the hand at places (K, 3) [m], and of reaching these places."""
     middle = (spots.max(axis=0) + spots.min(axis=0)) / 2
-    obstacles = at.others(thing, middle, float(np.ptp(spots[:, :2], axis=0).max()) / 2 + HAND + CLEAR)
+    obstacles = situation.surroundings(thing, middle, float(np.ptp(spots[:, :2], axis=0).max()) / 2 + HAND + CLEAR)
     gaps = clearance(spots, yaws, obstacles, leans)
-    return 3 * np.maximum(0, CLEAR - gaps) + 10 * np.maximum(0, TOUCHING - gaps) + far(at, spots)
+    return 3 * np.maximum(0, CLEAR - gaps) + 10 * np.maximum(0, TOUCHING - gaps) + reach_costs(situation, spots)
 
 
-def across(points: Array) -> Iterator[tuple[float, Grasp]]:
+def grasps_across(points: Array) -> Iterator[tuple[float, Grasp]]:
     """Yield width [m] and grasp across a whole thing."""
     bottom, top = points[:, 2].min(), points[:, 2].max()
     height = max(top - PALM, bottom + TIP + 0.003)
@@ -127,7 +132,7 @@ def walls(points: Array) -> Iterator[tuple[float, Grasp]]:
                 yield width, Grasp(np.array([*(spot - side * inwards * closing), edge - RIM]), float(yaw))
 
 
-def leaning(points: Array) -> Iterator[tuple[float, Grasp]]:
+def leaning_grasps(points: Array) -> Iterator[tuple[float, Grasp]]:
     """Yield width [m] and grasp of a wall with a hand that leans to a side."""
     for width, grasp in walls(points):
         for lean in (-LEAN, LEAN):

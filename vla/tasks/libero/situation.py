@@ -58,7 +58,7 @@ class Situation:
         closing, across, ahead = self.rotation.T
         self.yaw = float(np.arctan2(-closing[0], closing[1] if self.upright else across[0]))
         self.lean = float(np.arctan2(ahead[:2] @ (np.cos(self.yaw), np.sin(self.yaw)), -ahead[2]))
-        self.__dict__.pop("rest", None)
+        self.__dict__.pop("all_points", None)
         self._points: dict[str, Array] = {}
 
     @property
@@ -91,21 +91,21 @@ class Situation:
             self._points[thing] = np.concatenate(self.pieces(thing))
         return self._points[thing]
 
-    def moving(self, joint: int) -> list[Array]:
+    def moved_points(self, joint: int) -> list[Array]:
         """Return points (N, 3) on each geom of the body that a joint moves [m]."""
         body = int(self.model.jnt_bodyid[joint])
         thing = next(name for name, root in self.goal.bodies.items() if root == self.goal.owner[body])
         return self.pieces(thing, body)
 
-    def others(self, thing: str, middle: Array, radius: float) -> Array:
+    def surroundings(self, thing: str, middle: Array, radius: float) -> Array:
         """Return points (N, 3) on all but one thing, in a square of half width `radius` about `middle` (2,) [m]."""
-        points, owners = self.rest
+        points, owners = self.all_points
         mask = (np.abs(points[:, :2] - middle[:2]) < radius).all(axis=1)
         mask &= owners != self.goal.bodies.get(thing, -1)
         return points[mask]
 
     @cached_property
-    def rest(self) -> tuple[Array, Array]:
+    def all_points(self) -> tuple[Array, Array]:
         """Points (N, 3) on all things [m], and the bodies (N,) that they belong to."""
         points = [self.points(thing)[self._sparse[thing]] for thing in self._shapes]
         owners = [np.full(len(cloud), body) for cloud, body in zip(points, self.goal.bodies.values(), strict=True)]
@@ -118,7 +118,7 @@ class Situation:
         owner = self.goal.owner[self.model.site_bodyid[self.goal.sites[name]]]
         return next((thing for thing, root in self.goal.bodies.items() if root == owner), "")
 
-    def touched(self) -> str | None:
+    def grasped_thing(self) -> str | None:
         """Return the movable thing that both fingers touch, or one of them if they are commanded shut and yet apart."""
         bodies = self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]
         contacts = []

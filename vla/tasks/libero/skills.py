@@ -32,45 +32,46 @@ TWIST = 0.4  # lead of the hand over a knob that it turns [rad]
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def approach(at: Situation, grasp: Grasp, points: Array, thing: str, opening: float = -1.0) -> Array:
+def approach(situation: Situation, grasp: Grasp, points: Array, thing: str, opening: float = -1.0) -> Array:
     """Move to a grasp of points (N, 3) of a thing from above, along the hand, and close the fingers there.
 
     The hand descends where its fingers clear the thing, and corrects the remaining error meanwhile. The height changes
     gradually with the free room, so that no centimetre, which a policy can hardly see, decides between up and down.
     """
-    grasp = alike(at, grasp)
+    grasp = equivalent_grasp(situation, grasp)
     slope = np.array([*(-np.tan(grasp.lean) * axes(grasp.yaw)[1]), 1.0])  # of the line on which the hand comes
-    height = at.hand[2] - grasp.position[2]
-    offset = (at.hand - grasp.position - max(height, 0.0) * slope) * (1, 1, 0)
+    height = situation.hand[2] - grasp.position[2]
+    offset = (situation.hand - grasp.position - max(height, 0.0) * slope) * (1, 1, 0)
     distance = float(np.hypot(*offset[:2]))
-    turn = max(abs(at.turn_to(grasp.yaw)), abs(at.lean - grasp.lean))
-    factor = 1.0 if at.opening > 0.5 else 1.6  # fingers that have begun to close go on unless the hand is far off
+    turn = max(abs(situation.turn_to(grasp.yaw)), abs(situation.lean - grasp.lean))
+    # Fingers that have begun to close go on unless the hand is far off.
+    factor = 1.0 if situation.opening > 0.5 else 1.6
     if distance < factor * NEAR and turn < factor * TURNED and abs(height) < factor * LEVEL:
-        return command(at, grasp.position, grasp.yaw, 1.0, grasp.lean)
-    obstacles = at.others(thing, grasp.position, HAND)
+        return command(situation, grasp.position, grasp.yaw, 1.0, grasp.lean)
+    obstacles = situation.surroundings(thing, grasp.position, HAND)
     # Heights of the hand at which its fingers are above the thing, and above what stands about.
     thing_top, obstacle_top = (cloud[:, 2].max(initial=-np.inf) + TIP + MARGIN for cloud in (points, obstacles))
-    pose = Grasp(grasp.position + offset, at.yaw, grasp.lean)
-    aligned = (NEAR if at.hand[2] > thing_top - 0.01 else 1.6 * NEAR) - distance
+    pose = Grasp(grasp.position + offset, situation.yaw, grasp.lean)
+    aligned = (NEAR if situation.hand[2] > thing_top - 0.01 else 1.6 * NEAR) - distance
     turn_room = TURNED_ROOM * (1.6 * TURNED - turn)
     # How far [m] the hand is from where it may not come down, past what stands about and past the thing itself.
-    obstacle_room = min(max(room_of(at, thing, pose) - TOUCHING, aligned), ROOM - distance, turn_room)
+    obstacle_room = min(max(room_of(situation, thing, pose) - TOUCHING, aligned), ROOM - distance, turn_room)
     thing_room = min(max(gap_of(pose, points), aligned), obstacle_room)
-    if opening < 0 and at.opening < 0.5:  # fingers that are still closed would come down on the thing
+    if opening < 0 and situation.opening < 0.5:  # fingers that are still closed would come down on the thing
         thing_room = -ROOM
-    thing_height = lowest(at, thing_top + _funnel(distance - NEAR), thing_room)
-    obstacle_height = lowest(at, obstacle_top + _funnel(-obstacle_room), obstacle_room)
+    thing_height = lowest(situation, thing_top + _funnel(distance - NEAR), thing_room)
+    obstacle_height = lowest(situation, obstacle_top + _funnel(-obstacle_room), obstacle_room)
     rise = max(0.0, thing_height - grasp.position[2], obstacle_height - grasp.position[2])
     target = grasp.position + rise * slope
-    return command(at, rising(at, target), grasp.yaw, opening, grasp.lean)
+    return command(situation, rising_target(situation, target), grasp.yaw, opening, grasp.lean)
 
 
-def lowest(at: Situation, top: float, room: float) -> float:
+def lowest(situation: Situation, top: float, room: float) -> float:
     """Return the lowest height of the hand [m] among obstacles up to height `top`, with free room `room` [m].
 
     Where there is room the hand sinks, the faster the more there is; where there is none, it rises to the top.
     """
-    return min(top, float(at.hand[2]) - FUNNEL * room)
+    return min(top, float(situation.hand[2]) - FUNNEL * room)
 
 
 def _funnel(distance: float) -> float:
@@ -78,79 +79,82 @@ def _funnel(distance: float) -> float:
     return min(max(distance, 0.0) * FUNNEL, HOVER)
 
 
-def carry(at: Situation, thing: str, place: Place) -> Array:
+def carry(situation: Situation, thing: str, place: Place) -> Array:
     """Carry the held thing to a place, and let go of it there."""
-    origin, yaw, lean = at.origin(thing), at.yaw + place.turn, LEAN * round(at.lean / LEAN)
-    if place.hidden is not None:
-        return command(at, at.hand + place.hidden + 0.01 * UP, yaw, 1.0, lean)
-    if place.out is not None:  # a roof is over the place: first to where it ends, then straight in
-        direction = place.out / np.linalg.norm(place.out)
+    origin, yaw, lean = situation.origin(thing), situation.yaw + place.turn, LEAN * round(situation.lean / LEAN)
+    if place.current_exit is not None:
+        return command(situation, situation.hand + place.current_exit + 0.01 * UP, yaw, 1.0, lean)
+    if place.exit is not None:  # a roof is over the place: first to where it ends, then straight in
+        direction = place.exit / np.linalg.norm(place.exit)
         offset = origin - place.spot
         depth = float(offset @ direction)  # that the thing still has to go in
         deviation = float(np.linalg.norm(offset - depth * direction))
-        if deviation > 0.02 or depth > np.linalg.norm(place.out) + 0.03:
-            place = Place(place.spot + place.out, place.turn, 0.0)
+        if deviation > 0.02 or depth > np.linalg.norm(place.exit) + 0.03:
+            place = Place(place.spot + place.exit, place.turn, 0.0)
         elif depth > 0.004:
-            return command(at, at.hand + place.spot - origin, yaw, 1.0, lean)
+            return command(situation, situation.hand + place.spot - origin, yaw, 1.0, lean)
     offset = place.spot - origin
     distance = float(np.hypot(*offset[:2]))
-    rests = offset[2] > -RESTS and place.slack == LOOSE and at.rests(thing)
+    rests = offset[2] > -RESTS and place.slack == LOOSE and situation.rests(thing)
     if distance < (0.03 if rests else min(0.015, place.slack)) and abs(place.turn) < TURNED:
         if rests:
-            return command(at, at.hand, yaw, -1.0, lean)
+            return command(situation, situation.hand, yaw, -1.0, lean)
         if offset[2] > -0.012:
-            return let_go(at, thing)
+            return let_go(situation, thing)
     distance += 0.1 * abs(place.turn)
-    target = at.hand + offset + np.clip(FUNNEL * (distance - 0.6 * place.slack), 0.0, CARRY) * UP
-    pass_height = target[2] + max(0.0, _pass_height(at, thing, place.spot))  # height over all that is on the way
-    target[2] = max(target[2], lowest(at, pass_height, max(place.slack, 0.015) - distance))
-    return command(at, rising(at, target), yaw, 1.0, lean)
+    target = situation.hand + offset + np.clip(FUNNEL * (distance - 0.6 * place.slack), 0.0, CARRY) * UP
+    pass_height = target[2] + max(0.0, _pass_height(situation, thing, place.spot))  # height over all that is on the way
+    target[2] = max(target[2], lowest(situation, pass_height, max(place.slack, 0.015) - distance))
+    return command(situation, rising_target(situation, target), yaw, 1.0, lean)
 
 
-def let_go(at: Situation, thing: str) -> Array:
+def let_go(situation: Situation, thing: str) -> Array:
     """Let go of a held thing; if it hangs askew, first lower it until what is below it has righted it."""
-    points, frame = at.points(thing), at.data.xmat[at.goal.bodies[thing]].reshape(3, 3)
+    points, frame = situation.points(thing), situation.data.xmat[situation.goal.bodies[thing]].reshape(3, 3)
     axis = int(np.argmax(np.abs(frame[2])))
     up = frame[:, axis] * np.sign(frame[2, axis])  # of the thing
-    standing = at.hand @ up - (points @ up).min()  # height of the hand over the ground once the thing is straight
-    hangs = up[2] < STRAIGHT and at.hand[2] - points[:, 2].min() > standing + 0.002
-    return command(at, at.hand - (0.01 * UP if hangs else 0.0), at.yaw, 1.0 if hangs else -1.0, at.lean)
+    # Height of the hand over the ground once the thing is straight.
+    standing = situation.hand @ up - (points @ up).min()
+    hangs = up[2] < STRAIGHT and situation.hand[2] - points[:, 2].min() > standing + 0.002
+    return command(
+        situation, situation.hand - (0.01 * UP if hangs else 0.0), situation.yaw, 1.0 if hangs else -1.0, situation.lean
+    )
 
 
-def alike(at: Situation, grasp: Grasp) -> Grasp:
+def equivalent_grasp(situation: Situation, grasp: Grasp) -> Grasp:
     """Return the grasp, equal up to a swap of the fingers, that the hand reaches by the smallest turn."""
-    turn = at.turn_to(grasp.yaw)
-    same = np.cos(at.yaw + turn - grasp.yaw) > 0
-    return Grasp(grasp.position, at.yaw + turn, grasp.lean if same else -grasp.lean)
+    turn = situation.turn_to(grasp.yaw)
+    same = np.cos(situation.yaw + turn - grasp.yaw) > 0
+    return Grasp(grasp.position, situation.yaw + turn, grasp.lean if same else -grasp.lean)
 
 
-def _pass_height(at: Situation, thing: str, spot: Array) -> float:
+def _pass_height(situation: Situation, thing: str, spot: Array) -> float:
     """Return how far above its spot a thing must be to pass over everything on the way there [m]."""
-    origin = at.origin(thing)
-    bottom = at.points(thing)[:, 2].min() - origin[2]
+    origin = situation.origin(thing)
+    bottom = situation.points(thing)[:, 2].min() - origin[2]
     path = spot[:2] - origin[:2]
     length = float(np.hypot(*path)) + 1e-9
-    obstacles = at.others(thing, (spot + origin) / 2, length / 2 + SWEEP)
+    obstacles = situation.surroundings(thing, (spot + origin) / 2, length / 2 + SWEEP)
     progress = np.clip((obstacles[:, :2] - origin[:2]) @ path / length, 0, length)
     distances = np.linalg.norm(obstacles[:, :2] - origin[:2] - progress[:, None] * path / length, axis=1)
     return float(obstacles[distances < SWEEP, 2].max(initial=-np.inf) - (spot[2] + bottom))
 
 
-def drag(at: Situation, thing: str, displacement: Array) -> Array:
+def drag(situation: Situation, thing: str, displacement: Array) -> Array:
     """Move a hollow thing that cannot be grasped by (3,) [m]: closed fingers inside press its wall."""
-    points, origin = at.points(thing), at.origin(thing)
+    points, origin = situation.points(thing), situation.origin(thing)
     heading = displacement / np.linalg.norm(displacement)
     radius = float(np.ptp(points[:, :2], axis=0).min()) / 2
     steps = origin + np.linspace(0.45, 0.0, 6)[:, None] * radius * heading  # the farther out, the higher the bottom is
     floors = np.array([_height_at(points, step) for step in steps])
     flat = floors <= floors[-1] + 0.35 * (points[:, 2].max() - floors[-1])
     spot = np.array([*steps[int(np.argmax(flat))][:2], floors[int(np.argmax(flat))] + TIP])
-    is_inside = np.linalg.norm((at.hand - origin)[:2]) < 0.8 * radius
+    is_inside = np.linalg.norm((situation.hand - origin)[:2]) < 0.8 * radius
     yaw = float(np.arctan2(heading[1], heading[0]))
-    if is_inside and at.hand[2] < spot[2] + 0.006:
-        target = at.hand + min(SLOW, float(np.linalg.norm(displacement))) * heading
-        return command(at, np.array([*target[:2], spot[2] - 0.005]), yaw, 1.0)
-    return approach(at, Grasp(spot, yaw), points, thing, closing(at, float(points[:, 2].max())))
+    if is_inside and situation.hand[2] < spot[2] + 0.006:
+        target = situation.hand + min(SLOW, float(np.linalg.norm(displacement))) * heading
+        return command(situation, np.array([*target[:2], spot[2] - 0.005]), yaw, 1.0)
+    return approach(situation, Grasp(spot, yaw), points, thing, closing_command(situation, float(points[:, 2].max())))
 
 
 def _height_at(points: Array, spot: Array) -> float:
@@ -159,47 +163,52 @@ def _height_at(points: Array, spot: Array) -> float:
     return float(points[distance < max(0.012, float(distance.min())), 2].max(initial=points[:, 2].min()))
 
 
-def pull(at: Situation, place: str) -> Array:
+def pull(situation: Situation, place: str) -> Array:
     """Open a drawer by its handle: the hand comes from the front, one finger over the bar and one under it."""
-    joint = int(at.goal.joints(place)[0])
-    axis = -at.data.xaxis[joint]  # openings are negative
-    bar = max(at.moving(joint), key=lambda points: float((points @ axis).max()))
+    joint = int(situation.goal.joints(place)[0])
+    axis = -situation.data.xaxis[joint]  # openings are negative
+    bar = max(situation.moved_points(joint), key=lambda points: float((points @ axis).max()))
     middle = (bar.max(axis=0) + bar.min(axis=0)) / 2 - 0.006 * axis
     turns = [np.stack([side, np.cross(-axis, side), -axis], axis=1) for side in (UP, -UP)]  # the fingers are alike
-    rotation = min(turns, key=lambda turn: float(np.linalg.norm(_turn(at, turn))))
-    offset = at.hand - middle
+    rotation = min(turns, key=lambda turn: float(np.linalg.norm(_turn(situation, turn))))
+    offset = situation.hand - middle
     distance = float(offset @ axis)
-    deviation, angle = float(np.linalg.norm(offset - distance * axis)), float(np.linalg.norm(_turn(at, rotation)))
+    deviation, angle = (
+        float(np.linalg.norm(offset - distance * axis)),
+        float(np.linalg.norm(_turn(situation, rotation))),
+    )
     if deviation < 1.5 * NEAR and angle < 2 * TURNED and abs(distance) < 2 * LEVEL:
-        grips = at.opening < FIRM and at.gap > THIN
-        return move(at, middle + (0.012 if grips else 0.0) * axis, rotation, 1.0)  # slowly, or the fingers slip
-    if at.upright and at.hand[2] < middle[2] - 0.03:
-        return command(at, np.array([*at.hand[:2], middle[2]]), 0.0, -1.0)
-    if distance < 0.09 and at.hand[2] < tops(at) and angle > 0.5:
-        return move(at, at.hand + 0.05 * UP, rotation, -1.0)
-    room = min(2 * NEAR - deviation, TURNED_ROOM * (2 * TURNED - angle)) if at.opening > 0.9 else -ROOM
-    return move(at, middle + np.clip(distance - FUNNEL * room, 0.0, 0.11) * axis, rotation, -1.0)
+        grips = situation.opening < FIRM and situation.gap > THIN
+        return move(situation, middle + (0.012 if grips else 0.0) * axis, rotation, 1.0)  # slowly, or the fingers slip
+    if situation.upright and situation.hand[2] < middle[2] - 0.03:
+        return command(situation, np.array([*situation.hand[:2], middle[2]]), 0.0, -1.0)
+    if distance < 0.09 and situation.hand[2] < tops(situation) and angle > 0.5:
+        return move(situation, situation.hand + 0.05 * UP, rotation, -1.0)
+    room = min(2 * NEAR - deviation, TURNED_ROOM * (2 * TURNED - angle)) if situation.opening > 0.9 else -ROOM
+    return move(situation, middle + np.clip(distance - FUNNEL * room, 0.0, 0.11) * axis, rotation, -1.0)
 
 
-def twist(at: Situation, thing: str, turn: float) -> Array:
+def twist(situation: Situation, thing: str, turn: float) -> Array:
     """Turn a knob: grasp it from above across its narrow side, and turn the hand by `turn` [rad]."""
-    joint = int(at.goal.joints(thing)[0])
-    pieces = at.moving(joint)
-    grasp = min(parts(pieces, alone=False), key=lambda pair: pair[0] + 0.02 * abs(at.turn_to(pair[1].yaw)))[1]
-    grasp = Grasp(np.array([*at.data.xanchor[joint][:2], grasp.position[2]]), grasp.yaw)
-    holds = at.opening < FIRM and at.gap > THIN and np.linalg.norm(at.hand - grasp.position) < 3 * NEAR
+    joint = int(situation.goal.joints(thing)[0])
+    pieces = situation.moved_points(joint)
+    grasp = min(parts(pieces, alone=False), key=lambda pair: pair[0] + 0.02 * abs(situation.turn_to(pair[1].yaw)))[1]
+    grasp = Grasp(np.array([*situation.data.xanchor[joint][:2], grasp.position[2]]), grasp.yaw)
+    holds = (
+        situation.opening < FIRM and situation.gap > THIN and np.linalg.norm(situation.hand - grasp.position) < 3 * NEAR
+    )
     if holds:
-        return command(at, grasp.position, at.yaw + turn, 1.0)
-    return approach(at, grasp, np.concatenate(pieces), thing)
+        return command(situation, grasp.position, situation.yaw + turn, 1.0)
+    return approach(situation, grasp, np.concatenate(pieces), thing)
 
 
-def push(at: Situation, thing: str) -> Array:
+def push(situation: Situation, thing: str) -> Array:
     """Close a drawer or a door: push it, from outside, with closed fingers."""
-    joint = int(at.goal.joints(thing)[0])
-    points, axis = np.concatenate(at.moving(joint)), at.data.xaxis[joint]
+    joint = int(situation.goal.joints(thing)[0])
+    points, axis = np.concatenate(situation.moved_points(joint)), situation.data.xaxis[joint]
     direction = axis
-    if at.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
-        arms = points - at.data.xanchor[joint]
+    if situation.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+        arms = points - situation.data.xanchor[joint]
         arms -= np.outer(arms @ axis, axis)
         reach = np.linalg.norm(arms, axis=1) / np.linalg.norm(arms, axis=1).max()
         middle = (reach > 0.5) & (reach < 0.7)  # nearer to the hinge it is heavy, farther out the arm must stretch
@@ -208,66 +217,68 @@ def push(at: Situation, thing: str) -> Array:
     depth = points @ direction
     face = points[depth < depth.min() + 0.012]
     contact = np.array([*face[:, :2].mean(axis=0), max(face[:, 2].max() - 0.035, face[:, 2].mean())])
-    offset = at.hand - contact
+    offset = situation.hand - contact
     distance = float(offset @ direction)
     deviation = float(np.linalg.norm((offset - distance * direction)[:2]))
     # The fingers' broad side pushes, and the hand leans back, so that the arm stays off what is over a drawer.
-    pose = alike(at, Grasp(contact, float(np.arctan2(direction[1], direction[0])), BACK))
+    pose = equivalent_grasp(situation, Grasp(contact, float(np.arctan2(direction[1], direction[0])), BACK))
     if -0.06 < distance < 0.02 and deviation < 0.03 and abs(offset[2]) < 0.03:
-        return command(at, contact + 0.05 * direction, pose.yaw, 1.0, pose.lean)
-    grip = closing(at, tops(at))
+        return command(situation, contact + 0.05 * direction, pose.yaw, 1.0, pose.lean)
+    grip = closing_command(situation, tops(situation))
     start = contact - 0.045 * direction
-    height = max(tops(at), contact[2]) + 0.04
-    start[2] = max(start[2], lowest(at, height, ROOM - float(np.hypot(*(at.hand - start)[:2]))))
-    return command(at, rising(at, start), pose.yaw, grip, pose.lean)
+    height = max(tops(situation), contact[2]) + 0.04
+    start[2] = max(start[2], lowest(situation, height, ROOM - float(np.hypot(*(situation.hand - start)[:2]))))
+    return command(situation, rising_target(situation, start), pose.yaw, grip, pose.lean)
 
 
-def closing(at: Situation, top: float) -> float:
+def closing_command(situation: Situation, top: float) -> float:
     """Return the gripper command: close, unless the open fingers could close on something below height `top` [m]."""
-    return 1.0 if at.gap < EMPTY or at.hand[2] > top + TIP else -1.0
+    return 1.0 if situation.gap < EMPTY or situation.hand[2] > top + TIP else -1.0
 
 
-def withdraw(at: Situation) -> Array:
+def withdraw(situation: Situation) -> Array:
     """Retract a hand that does not point down, opposite to where it points, then turn it down."""
-    obstacles = at.others("", at.hand, 0.1)
-    if len(obstacles) and np.linalg.norm(obstacles - at.hand, axis=1).min() < 0.09:
-        return move(at, at.hand - 0.05 * at.rotation[:, 2], at.rotation, -1.0)
-    inwards = at.base - at.hand  # so that the arm is not stretched
-    return command(at, at.hand + np.array([*(0.05 * inwards[:2] / np.hypot(*inwards[:2])), 0.02]), 0.0, -1.0)
+    obstacles = situation.surroundings("", situation.hand, 0.1)
+    if len(obstacles) and np.linalg.norm(obstacles - situation.hand, axis=1).min() < 0.09:
+        return move(situation, situation.hand - 0.05 * situation.rotation[:, 2], situation.rotation, -1.0)
+    inwards = situation.base - situation.hand  # so that the arm is not stretched
+    return command(
+        situation, situation.hand + np.array([*(0.05 * inwards[:2] / np.hypot(*inwards[:2])), 0.02]), 0.0, -1.0
+    )
 
 
-def tops(at: Situation) -> float:
+def tops(situation: Situation) -> float:
     """Return the largest height of what stands near the hand [m]."""
-    return float(at.others("", at.hand, HAND + 0.05)[:, 2].max(initial=-np.inf))
+    return float(situation.surroundings("", situation.hand, HAND + 0.05)[:, 2].max(initial=-np.inf))
 
 
-def rising(at: Situation, target: Array) -> Array:
+def rising_target(situation: Situation, target: Array) -> Array:
     """Reduce the horizontal motion while the hand has to rise, so that it hits nothing."""
-    rise = target[2] - at.hand[2]
+    rise = target[2] - situation.hand[2]
     if rise > 0.01:
-        target = np.array([*(at.hand[:2] + (target[:2] - at.hand[:2]) * 0.02 / (0.02 + rise)), target[2]])
+        target = np.array([*(situation.hand[:2] + (target[:2] - situation.hand[:2]) * 0.02 / (0.02 + rise)), target[2]])
     return target
 
 
-def command(at: Situation, target: Array, yaw: float, grip: float, lean: float = 0.0) -> Array:
+def command(situation: Situation, target: Array, yaw: float, grip: float, lean: float = 0.0) -> Array:
     """Return the command that moves the hand, pointing down, towards a position, a yaw and a lean."""
-    yaw = at.yaw + at.turn_to(yaw)
+    yaw = situation.yaw + situation.turn_to(yaw)
     closing_axis, cross_axis = (np.array([*axis, 0.0]) for axis in axes(yaw))
     direction = np.sin(lean) * cross_axis - np.cos(lean) * UP
-    return move(at, target, np.stack([closing_axis, np.cross(direction, closing_axis), direction], axis=1), grip)
+    return move(situation, target, np.stack([closing_axis, np.cross(direction, closing_axis), direction], axis=1), grip)
 
 
-def move(at: Situation, target: Array, rotation: Array, grip: float) -> Array:
+def move(situation: Situation, target: Array, rotation: Array, grip: float) -> Array:
     """Return the command that moves the hand towards a position and a rotation (3, 3): closing, across, ahead."""
-    step = GAIN * (target - at.hand) / REACH[:3]
+    step = GAIN * (target - situation.hand) / REACH[:3]
     step /= max(1.0, float(np.abs(step).max()))
-    turn = TURN_GAIN * _turn(at, rotation) / REACH[3:]
+    turn = TURN_GAIN * _turn(situation, rotation) / REACH[3:]
     return np.array([*step, *(turn / max(1.0, float(np.abs(turn).max()))), grip])
 
 
-def _turn(at: Situation, rotation: Array) -> Array:
+def _turn(situation: Situation, rotation: Array) -> Array:
     """Return the rotation vector (3,), in the world, from the hand's rotation to another one."""
     quaternion, vector = np.empty(4), np.empty(3)
-    mujoco.mju_mat2Quat(quaternion, (rotation @ at.rotation.T).ravel())
+    mujoco.mju_mat2Quat(quaternion, (rotation @ situation.rotation.T).ravel())
     mujoco.mju_quat2Vel(vector, quaternion, 1.0)
     return vector

@@ -67,18 +67,18 @@ class Starts:
         }
         return Start(self._states[number].copy(), poses)
 
-    def drawn(self, random: np.random.Generator, exchanged: bool) -> Start:
+    def draw(self, random: np.random.Generator, exchange: bool) -> Start:
         """Draw a start: fixtures, things, openings and the arm's posture, up to `DRAWS` times more if things overlap.
 
         Things on a table are drawn from the ranges of their regions, other things and openings from the range of the
-        official states; heights and tilts are those of the official states, which share them. With `exchanged`, two
+        official states; heights and tilts are those of the official states, which share them. With `exchange`, two
         pairs of things on tables, or one pair, swap their regions first, where sentence and goal remain true.
         """
-        start = self._draw(random, exchanged)
+        start = self._draw(random, exchange)
         for _ in range(DRAWS):
             if self._overlaps(start) <= self._usual:
                 break
-            start = self._draw(random, exchanged)
+            start = self._draw(random, exchange)
         return start
 
     def _may_move(self, thing: str) -> bool:

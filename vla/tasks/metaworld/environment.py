@@ -15,7 +15,7 @@ from vla.spec import Array, Observation, Spec
 from vla.tasks.metaworld.package import tasks_of
 from vla.tasks.metaworld.scene import CAMERA, TaskScene, parts_of
 from vla.tasks.rendering.renderer import RendererFactory
-from vla.tasks.world import ManyTasks
+from vla.tasks.world import MultitaskWorld
 
 CONTROL_HZ = 80.0  # five substeps of 2.5 ms
 REACH = 0.01  # largest displacement of the hand per step, along each axis [m]
@@ -34,7 +34,7 @@ def within(window: Sequence[float]) -> bool:
 Window = Annotated[tuple[Share, Share, Share, Share], Predicate(within)]
 
 
-class MetaWorld(ManyTasks):
+class MetaWorld(MultitaskWorld):
     """Fifty tasks of a Sawyer arm, one of them per episode: seeds cycle through them.
 
     An episode ends at the first step that Meta-World counts as a success, or when its steps are used up. The state is

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from vla.io.errors import UserError
-from vla.io.parts import WHOLE, Part, cut
+from vla.io.parts import FULL_WINDOW, Part, cut
 from vla.spec import Array, Spec
 from vla.tasks.metaworld.package import simulator, stop_sliding
 from vla.tasks.rendering.renderer import LazyRenderer, RendererFactory, Views
@@ -77,7 +77,7 @@ class TaskScene:
     def pictures(self) -> Array:
         """Draw every camera's picture (cameras, H, W, 3) uint8."""
         hand = self.simulator.get_endeff_pos()
-        windows = np.array([part.at(hand) for part in self._parts])
+        windows = np.array([part.window_at(hand) for part in self._parts])
         if self._drawn_size is None:
             return self._renderer.render(self.simulator.data, windows)[0]
         pictures = dict(zip(self._views.cameras, self._renderer.render(self.simulator.data)[0], strict=True))
@@ -96,7 +96,7 @@ def parts_of(cameras: Sequence[str], window: Sequence[float] | None, hand_size: 
     If only CAMERA shows it, and all of it, there are no parts.
     """
     if CAMERA in cameras and (window is not None or HAND in cameras):
-        yield Part(CAMERA, tuple(window or WHOLE))
+        yield Part(CAMERA, tuple(window or FULL_WINDOW))
     if HAND in cameras:
         half = hand_size / 2
         yield Part(HAND, (-half, -half, half, half), PLACE, MIDDLE, _projection(), LEROBOT)

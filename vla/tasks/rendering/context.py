@@ -36,7 +36,7 @@ class Context:
         self._lock = Lock()
 
     @contextmanager
-    def current(self) -> Iterator[None]:
+    def make_current(self) -> Iterator[None]:
         """Make the context current; other renderers may have changed its bindings."""
         with self._lock, self.gl:
             yield
@@ -63,7 +63,7 @@ class Context:
 
     def clean(self) -> None:
         """Free the objects that nobody refers to any more."""
-        with self.current():
+        with self.make_current():
             self.gl.gc()
 
 

@@ -18,22 +18,22 @@ METHOD = "fast-simplification 0.2"  # part of the cache key: another method give
 Mesh = tuple[Array, Array, Array]  # vertices (V, 3) float32, faces (F, 3) int32, texture coordinates (F, 3 corners, 2)
 
 
-def decimate(vertices: Array, faces: Array, texcoord: Array | None, most: int) -> Mesh:
-    """Simplify a mesh to at most about `most` faces, with its texture in the same places.
+def decimate(vertices: Array, faces: Array, texcoord: Array | None, max_faces: int) -> Mesh:
+    """Simplify a mesh to at most about `max_faces` faces, with its texture in the same places.
 
     Args:
         vertices: (V, 3).
         faces: (F, 3) indices of vertices.
         texcoord: (F, 3 corners, 2), or None.
-        most: number of faces.
+        max_faces: number of faces.
     """
     vertices, faces = np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32)
-    content = hashlib.sha256(f"{METHOD} {most} {len(vertices)}".encode() + vertices.tobytes() + faces.tobytes())
+    content = hashlib.sha256(f"{METHOD} {max_faces} {len(vertices)}".encode() + vertices.tobytes() + faces.tobytes())
     content.update(b"" if texcoord is None else np.ascontiguousarray(texcoord, np.float32).tobytes())
     path = cache_folder() / f"{content.hexdigest()[:32]}.npz"
     with suppress(OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error), np.load(path) as archive:
         return archive["vertices"], archive["faces"], archive["texcoord"]
-    result = _simplify(vertices, faces, texcoord, most)
+    result = _simplify(vertices, faces, texcoord, max_faces)
     # Written atomically, as other processes may read it; without disk space, the mesh is not cached.
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -23,7 +23,7 @@ from vla.tasks.gl import has_egl
 from vla.tasks.rendering import shaders, shapes, uniforms
 from vla.tasks.rendering.context import Context, shared_context
 from vla.tasks.rendering.decimate import decimate
-from vla.tasks.rendering.geometry import Buffers, Elements, Geometry, elements_of, unsupported
+from vla.tasks.rendering.geometry import Buffers, Elements, Geometry, elements_of, unsupported_features
 from vla.tasks.rendering.projections import ModelCameras, clip_range
 from vla.tasks.rendering.renderer import Renderer, Views
 from vla.tasks.rendering.shadows import STATE, Shadows
@@ -89,14 +89,14 @@ class FastRenderer:
     def __init__(self, context: Context, model: mujoco.MjModel, views: Views, settings: Fast) -> None:
         self._context, self._gl, self._model, self._views, self._settings = context, context.gl, model, views, settings
         self._cameras = ModelCameras(model, views)
-        if missing_features := unsupported(model, views):
+        if missing_features := unsupported_features(model, views):
             log.warning(f"the fast renderer leaves out {', '.join(missing_features)}; task/renderer=mujoco draws them")
         sky = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
         self._sky = int(sky[0]) if len(sky) else -1
         self._geometry = Geometry(model, self._mesh)
         casts_shadow = model.light_castshadow if model.vis.quality.shadowsize else np.zeros(model.nlight, bool)
         self._lamps = [int(light) for light in uniforms.drawn_lights(model) if casts_shadow[light]]
-        with context.current():
+        with context.make_current():
             self._make_targets()
             self._shadows = Shadows(self._gl, model, self._lamps, settings.soft)
             self._make_tables()
@@ -110,7 +110,7 @@ class FastRenderer:
         vertices, faces = shapes.mesh_triangles(self._model, mesh)
         if self._settings.faces is not None and len(faces) > self._settings.faces:
             texcoord = shapes.mesh_texcoord(self._model, mesh) if textured else None
-            return shapes.smoothed(*decimate(vertices, faces, texcoord, self._settings.faces))
+            return shapes.smooth_surface(*decimate(vertices, faces, texcoord, self._settings.faces))
         return shapes.mesh(self._model, mesh)
 
     def _make_targets(self) -> None:
@@ -164,10 +164,10 @@ class FastRenderer:
 
     def update(self, textures: Collection[int] = ()) -> None:
         """Upload what has changed in the model; `textures` are the ids of textures with changed pixels."""
-        with self._context.current():
+        with self._context.make_current():
             self._textures.upload(textures)
             elements = self._elements = elements_of(self._model, self._views)
-            self._planes = np.flatnonzero(elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE)).tolist()
+            self._planes = np.flatnonzero(elements.visible & (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE)).tolist()
             self._geometry.update(elements, self._sky >= 0)
             self._place_elements()
             self._cameras.update()
@@ -179,14 +179,14 @@ class FastRenderer:
     def _place_elements(self) -> None:
         """Upload the elements' triangles, and store their places in the buffer."""
         shapes, sky = self._geometry.elements, len(self._elements.kind)
-        self._buffers.update([shape.seen for shape in shapes])
-        ends = np.cumsum([0, *(shape.seen.triangles.size for shape in shapes)]).tolist()
+        self._buffers.update([shape.visible for shape in shapes])
+        ends = np.cumsum([0, *(shape.visible.triangles.size for shape in shapes)]).tolist()
         self._calls = {
-            shape.element: DrawCall(self._texture_of(shape.element), start, shape.seen.triangles.size)
+            shape.element: DrawCall(self._texture_of(shape.element), start, shape.visible.triangles.size)
             for shape, start in zip(shapes, ends, strict=False)
         }
         order = list(self._calls)
-        solid, self._transparent = order[: self._geometry.solid], order[self._geometry.solid :]
+        solid, self._transparent = order[: self._geometry.solid_count], order[self._geometry.solid_count :]
         self._opaque = np.array([element for element in solid if element != sky], int)
         radius = {shape.element: shape.radius for shape in shapes}
         radius |= dict.fromkeys(self._planes, np.inf)  # they may move along with a camera
@@ -222,7 +222,7 @@ class FastRenderer:
 
     def render(self, data: mujoco.MjData, windows: Array | None = None) -> tuple[Array, Array]:
         """Draw colours (cameras, H, W, 3) uint8 and depth (cameras, H, W) float32 [m]."""
-        with self._context.current():
+        with self._context.make_current():
             for unit, texture in enumerate(self._units):  # another renderer may have bound its own
                 texture.use(unit)
             self._upload_poses(data)
@@ -275,7 +275,7 @@ class FastRenderer:
     def _draw_transparent(self) -> None:
         """Blend transparent elements and planes seen from behind."""
         for number in range(len(self._cameras.ids)):
-            planes = [plane for plane in self._planes if self._cameras.behind(number, self._poses[plane])]
+            planes = [plane for plane in self._planes if self._cameras.sees_from_behind(number, self._poses[plane])]
             if self._transparent or planes:
                 self._aim(number)
                 self._blend(self._cameras.eyes[number], planes)

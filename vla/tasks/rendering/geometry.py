@@ -18,7 +18,7 @@ from vla.tasks.rendering.shapes import Surface
 HORIZON = 1.05  # half the extent of an infinite plane over the distance of the far clipping plane, as in MuJoCo
 SKY_DISTANCE = 0.7  # of the sky over the distance of the far clipping plane, as in MuJoCo
 Kind = mujoco.mjtGeom
-OPAQUE = 0.995  # smallest alpha of an opaque element in MuJoCo
+OPAQUE_ALPHA = 0.995  # smallest alpha of an opaque element in MuJoCo
 DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # of a geom that shows its material's colour
 RGB_ROLE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 
@@ -34,12 +34,12 @@ class Elements:
     material: Array  # (E,) id, or -1
     texture: Array  # (E,) id, or -1
     light: Array  # (E, 3) emission, specular, shininess
-    seen: Array  # (E,) bool
+    visible: Array  # (E,) bool
 
     @property
     def opaque(self) -> Array:
         """Mask (E,) of the elements that are drawn without blending."""
-        return self.seen & (self.rgba[:, 3] >= OPAQUE)
+        return self.visible & (self.rgba[:, 3] >= OPAQUE_ALPHA)
 
 
 def elements_of(model: mujoco.MjModel, views: Views) -> Elements:
@@ -70,20 +70,20 @@ def elements_of(model: mujoco.MjModel, views: Views) -> Elements:
     return Elements(kind, mesh, size, rgba, material, texture, light, is_shown & (rgba[:, 3] > 0))
 
 
-def unsupported(model: mujoco.MjModel, views: Views) -> list[str]:
+def unsupported_features(model: mujoco.MjModel, views: Views) -> list[str]:
     """Name the features of a model that MuJoCo's renderer draws and the fast one does not."""
     elements = elements_of(model, views)
     is_infinite = (elements.kind == mujoco.mjtGeom.mjGEOM_PLANE) & (elements.size[:, :2] <= 0).any(axis=1)
     sky = (model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any()
     light_types = (mujoco.mjtLightType.mjLIGHT_POINT, mujoco.mjtLightType.mjLIGHT_IMAGE)
-    materials = elements.material[elements.seen & (elements.material >= 0)]
+    materials = elements.material[elements.visible & (elements.material >= 0)]
     features = {
-        "height fields": (elements.seen & (elements.kind == mujoco.mjtGeom.mjGEOM_HFIELD)).any(),
+        "height fields": (elements.visible & (elements.kind == mujoco.mjtGeom.mjGEOM_HFIELD)).any(),
         "skins": model.nskin,
         "flexible bodies": model.nflex,
         "spatial tendons": (model.wrap_type != mujoco.mjtWrap.mjWRAP_JOINT).any(),
         "reflections": (model.mat_reflectance[materials] > 0).any(),
-        "haze at the horizon": sky and (elements.seen & is_infinite).any(),
+        "haze at the horizon": sky and (elements.visible & is_infinite).any(),
         "lights of the types point and image": np.isin(model.light_type, light_types).any(),
         "textures of one or two channels": (model.tex_nchannel < 3).any(),
         "slider-cranks": (model.actuator_trntype == mujoco.mjtTrn.mjTRN_SLIDERCRANK).any(),
@@ -125,7 +125,7 @@ class ElementTriangles:
 
     element: int
     key: tuple[Any, ...]  # what its vertices depend on
-    seen: Part  # with vertices of position, normal, texture coordinates or direction, element: 10 floats
+    visible: Part  # with vertices of position, normal, texture coordinates or direction, element: 10 floats
     casting: Part  # with vertices of position and element, 4 floats, shared by all triangles at the same place
     closed: bool  # whether the triangles enclose a volume
     radius: float  # of the smallest sphere around the element's origin that contains it [m]
@@ -152,13 +152,15 @@ class Geometry:
         planes = elements.kind == Kind.mjGEOM_PLANE
         # Small elements first: large ones are mostly behind them, and drawing hidden surfaces costs little.
         order = opaque[np.lexsort((opaque, self._reach[opaque], elements.texture[opaque], planes[opaque]))]
-        transparent = [self._shape(elements, int(index)) for index in np.flatnonzero(elements.seen & ~elements.opaque)]
+        transparent = [
+            self._shape(elements, int(index)) for index in np.flatnonzero(elements.visible & ~elements.opaque)
+        ]
         solid = [self._shape(elements, int(element)) for element in order]
         if sky:
             solid.append(self._sky(len(elements.kind)))
-        solid = [shape for shape in solid if len(shape.seen.triangles)]
-        self.solid = len(solid)
-        self.elements = [*solid, *(shape for shape in transparent if len(shape.seen.triangles))]
+        solid = [shape for shape in solid if len(shape.visible.triangles)]
+        self.solid_count = len(solid)
+        self.elements = [*solid, *(shape for shape in transparent if len(shape.visible.triangles))]
 
     def _shape(self, elements: Elements, element: int) -> ElementTriangles:
         model, material, texture = self._model, int(elements.material[element]), int(elements.texture[element])
@@ -174,11 +176,11 @@ class Geometry:
 
     def _surface(self, kind: int, mesh: int, size: Array, textured: bool) -> Surface:
         if kind in (Kind.mjGEOM_SPHERE, Kind.mjGEOM_ELLIPSOID):
-            return self._sphere.scaled(size)
+            return self._sphere.scale(size)
         if kind == Kind.mjGEOM_BOX:
-            return self._box.scaled(size)
+            return self._box.scale(size)
         if kind == Kind.mjGEOM_CYLINDER:
-            return self._cylinder.scaled(size)
+            return self._cylinder.scale(size)
         if kind == Kind.mjGEOM_CAPSULE:
             return shapes.capsule(self._slices, self._stacks, size[0], size[2])
         if kind == Kind.mjGEOM_PLANE:

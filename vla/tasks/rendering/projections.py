@@ -95,7 +95,7 @@ class ModelCameras:
         distances = self._sides[:, :, :3] @ centres.T + self._sides[:, :, 3:]
         return (distances > -radii).all(axis=1)
 
-    def behind(self, number: int, plane: Array) -> bool:
+    def sees_from_behind(self, number: int, plane: Array) -> bool:
         """Return whether a camera sees a plane of pose (3, 4) from behind."""
         return bool((self.eyes[number] - plane[:, 3]) @ plane[:, 2] < 0)
 

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import mujoco
 import numpy as np
 
-from vla.io.parts import WHOLE
+from vla.io.parts import FULL_WINDOW
 from vla.spec import Array
 from vla.tasks.rendering.projections import clip_range
 from vla.tasks.rendering.renderer import Views
@@ -65,7 +65,7 @@ class ReferenceRenderer:
         categories = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, categories, self._scene)
         if window is None and self._views.aspect is not None:
-            window = WHOLE
+            window = FULL_WINDOW
         if window is not None:
             for eye in self._scene.camera:
                 self._show(eye, *window)

@@ -35,7 +35,7 @@ class Surface:
     triangles: Array  # (T, 3) int32, indices of vertices, counterclockwise from outside
     source: Surface | None = None  # the shape that this one is a stretched copy of
 
-    def scaled(self, size: Array) -> Surface:
+    def scale(self, size: Array) -> Surface:
         """Return the shape stretched by `size` (3,)."""
         normal = self.normal / size
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -124,7 +124,7 @@ def cylinder(slices: int) -> Surface:
 
 def capsule(slices: int, stacks: int, radius: float, half_length: float) -> Surface:
     """Return a capsule along z [m]."""
-    parts = [tube(slices).scaled(np.array([radius, radius, half_length]))]
+    parts = [tube(slices).scale(np.array([radius, radius, half_length]))]
     for side in (-1, 1):
         cap = sphere(slices, stacks // 2, *sorted((0.0, float(side))))
         # Texture coordinates run from one pole to the equator and again from there.
@@ -182,7 +182,7 @@ def mesh(model: mujoco.MjModel, number: int) -> Surface:
     return _share_vertices(corners, normals, texcoord)
 
 
-def smoothed(vertices: Array, faces: Array, texcoord: Array) -> Surface:
+def smooth_surface(vertices: Array, faces: Array, texcoord: Array) -> Surface:
     """Return the surface of vertices (V, 3) and faces (F, 3) with texture coordinates (F, 3 corners, 2), with normals
     that are averaged over adjacent faces except at sharp edges."""
     corners = vertices[faces]

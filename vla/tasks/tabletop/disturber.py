@@ -47,9 +47,9 @@ class Disturber:
         events: control step and description of everything that has happened.
     """
 
-    def __init__(self, drawn: Disturbance, scene: CompiledScene) -> None:
+    def __init__(self, disturbance: Disturbance, scene: CompiledScene) -> None:
         """Take what was drawn for the episode, and the scene."""
-        self._disturbance, self._scene = drawn, scene
+        self._disturbance, self._scene = disturbance, scene
         self._steps_left = 0  # of a push or a drop
         self._possible_for = 0  # [steps]
         self.motion: Array | None = None
@@ -62,23 +62,23 @@ class Disturber:
             action = np.array([*self.motion, 0, 0, 0, action[6]])
         return np.append(action[:6], 1.0) if self.opens else action
 
-    def update(self, step: int, state: WorldState, now: Subgoal) -> bool:
+    def update(self, step: int, state: WorldState, subgoal: Subgoal) -> bool:
         """Continue a push or a drop, or start a disturbance that is due; return whether an object was moved.
 
         Args:
             step: index of the control step that comes next.
             state: state before it.
-            now: current subgoal.
+            subgoal: current subgoal.
         """
         self._steps_left = max(0, self._steps_left - 1)
         if self._steps_left:
             self.offset = self.offset if self.motion is None else self.offset + self.motion
             return False
         self.motion, self.offset, self.opens = None, np.zeros(3), False
-        if len(self.events) == self._disturbance.times or not self._is_possible(state, now):
+        if len(self.events) == self._disturbance.times or not self._is_possible(state, subgoal):
             return False
         self._possible_for += 1
-        if self._possible_for <= self._disturbance.delay or not (description := self._happen(state, now)):
+        if self._possible_for <= self._disturbance.delay or not (description := self._happen(state, subgoal)):
             return False
         self._possible_for = 0
         self.events.append((step, description))

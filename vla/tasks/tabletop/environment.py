@@ -125,7 +125,7 @@ class Tabletop(World):
         self._joint_noise, self._image_noise = np.random.RandomState(0), np.random.default_rng(0)
         task.disturber = None  # disturbances are for the agent of the episode
         with self.blind():
-            while task.current < number and not task.over:
+            while task.current < number and not task.is_over:
                 task.step(expert.act(self.look()))
         task.isolate()
 
@@ -133,7 +133,7 @@ class Tabletop(World):
         """Apply one (7,) action, clipped to the spec's bounds, for one control period."""
         self._require_running()
         self.simulation.step(action)
-        self._update_outcome(self.simulation.over)
+        self._update_outcome(self.simulation.is_over)
         return self.look()
 
     def drive(self, joints: Array, opening: float, seconds: float) -> None:
@@ -143,7 +143,7 @@ class Tabletop(World):
     def judge(self) -> None:
         """See `TakesJointTargets`."""
         self.simulation.judge()
-        self._update_outcome(self.simulation.over)
+        self._update_outcome(self.simulation.is_over)
 
     def _update_outcome(self, done: bool) -> None:
         classifier = self.simulation.classifier

@@ -19,7 +19,7 @@ from vla.spec import Array, RobotModel
 from vla.tasks.tabletop import fingertips, robot_spec
 from vla.tasks.tabletop.expert import CLEARANCE
 from vla.tasks.tabletop.robot import PHYSICS, TabletopRobot, attributes
-from vla.tasks.tabletop.robot_file import RobotFile, compiled, require
+from vla.tasks.tabletop.robot_file import RobotFile, compile_model, require
 from vla.tasks.tabletop.scene import BLOCK_HALF_SIZE
 
 PREFIX = "robot/"  # of the names of all elements in the scene
@@ -50,7 +50,7 @@ class FileRobot(TabletopRobot):
             UserError: a file is missing or does not compile, a name is not in it, or a value does not fit it.
         """
         self._file, self._spec = file, file.read()
-        spec, home = self._spec, robot_spec.checked_home(self._spec, file.joints, file.home)
+        spec, home = self._spec, robot_spec.require_home(self._spec, file.joints, file.home)
         if file.open.keys() != file.closed.keys():
             raise UserError(f"task.robot.open and closed must name the same, not {[*file.open]} and {[*file.closed]}")
         robot_spec.simplify(spec, file.joints, file.open)
@@ -59,7 +59,7 @@ class FileRobot(TabletopRobot):
         if np.linalg.norm(np.cross(np.subtract(file.target, file.camera), np.eye(3)[0])) < 1e-6:
             raise UserError("task.robot.camera and task.robot.target must differ, and not only along the tool's x axis")
         robot_spec.add_camera(*tool, np.array(file.camera), np.array(file.target))
-        sides = [fingertips.named(spec, side) for side in file.fingertips]
+        sides = [fingertips.colliding_geoms(spec, side) for side in file.fingertips]
         strength = zip(home, robot_spec.stiffness(spec, home, FREQUENCY), strict=True)  # as much as its inertia allows
         servos = [robot_spec.add_servo(spec, name, k, LEAD * k, None) for name, k in strength]
         grips = [self._grip(name, max(abs(file.open[name] - file.closed[name]), 1e-3)) for name in file.open]
@@ -129,7 +129,7 @@ class FileRobot(TabletopRobot):
         """
         scene = mujoco.MjSpec.from_string(f"<mujoco><option {attributes(**PHYSICS)}/></mujoco>")
         self.complete(scene)
-        self._model = model = compiled(scene)
+        self._model = model = compile_model(scene)
         self._data = data = mujoco.MjData(model)
         self.fingertips, self.tool = [[PREFIX + tip for tip in side] for side in sides], PREFIX + robot_spec.TOOL
         names = [model.joint(index).name for index in range(model.njnt)]

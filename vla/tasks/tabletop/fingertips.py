@@ -18,14 +18,14 @@ from vla.io.errors import UserError
 from vla.spec import Array
 from vla.tasks.rendering.shapes import mesh_triangles
 from vla.tasks.tabletop.robot import FINGERTIP_CONTACT, HIDDEN, ROBOT_CONTACT
-from vla.tasks.tabletop.robot_file import compiled, require
+from vla.tasks.tabletop.robot_file import compile_model, require
 from vla.tasks.tabletop.robot_spec import TOOL, add_hull
 
 FAR_END = 0.03  # length of the part of a jaw that holds a block [m]
 FAR = 1.0  # largest gap that is measured [m]
 
 
-def named(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
+def colliding_geoms(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
     """Return the names of colliding geoms in `names` and in the bodies `names`; a site becomes a geom of its shape."""
     geoms, bodies, sites = ({entry.name: entry for entry in kind} for kind in (spec.geoms, spec.bodies, spec.sites))
     require("fingertips", names, (*geoms, *bodies, *sites), "geom, body or site")
@@ -34,7 +34,8 @@ def named(spec: mujoco.MjSpec, names: Sequence[str]) -> list[str]:
         if name in geoms or name in bodies:
             tips += [geoms[name]] if name in geoms else bodies[name].geoms
         else:
-            site, at = sites[name], compiled(spec).site(name)  # with the frames around it, and its angles as quaternion
+            # With the frames around it, and its angles as quaternion.
+            site, at = sites[name], compile_model(spec).site(name)
             tips += [_add(site.parent, f"vla_tip_{name}", site.type, pos=at.pos, quat=at.quat, size=at.size)]
     solid = [tip.name for tip in tips if tip.contype or tip.conaffinity]
     if not solid:

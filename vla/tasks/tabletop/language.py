@@ -17,7 +17,7 @@ from vla.tasks.tabletop.scene import ColourName
 Phrasings = Annotated[Sequence[Annotated[str, MaxLen(300)]], MinLen(1)]
 Words = Annotated[Sequence[Annotated[str, MinLen(1), MaxLen(60)]], MinLen(1)]
 
-HeldOut = Literal["words", "phrasings", "combinations"]
+HeldOutKind = Literal["words", "phrasings", "combinations"]
 
 
 @dataclass(eq=False)
@@ -45,7 +45,7 @@ class Grammar:
         phrasings = (*self.phrasings, *self.held_out_phrasings)
         self.slots = {slot for phrasing in phrasings for slot in _slots(phrasing)} - {*words}
 
-    def renamed(self, slots: Mapping[str, str]) -> Grammar:
+    def rename(self, slots: Mapping[str, str]) -> Grammar:
         """Return the grammar with other names for some slots, old → new, which are replaced in that order."""
         grammar = copy(self)
         for old, new in slots.items():
@@ -56,12 +56,12 @@ class Grammar:
         return grammar
 
     @property
-    def held_out_kinds(self) -> tuple[HeldOut, ...]:
+    def held_out_kinds(self) -> tuple[HeldOutKind, ...]:
         """Kinds of held-out instructions that this grammar can generate."""
-        kinds: tuple[HeldOut, ...] = ("words", "phrasings") if self.held_out_words else ()
+        kinds: tuple[HeldOutKind, ...] = ("words", "phrasings") if self.held_out_words else ()
         return (*kinds, "combinations") if self.held_out_colours else kinds
 
-    def say(self, slots: Mapping[str, str], held_out: HeldOut | None, random_state: np.random.RandomState) -> str:
+    def say(self, slots: Mapping[str, str], held_out: HeldOutKind | None, random_state: np.random.RandomState) -> str:
         """Draw an instruction with the goal's `slots` filled; one part of it is held out, or nothing if None."""
         phrasings = self.held_out_phrasings if held_out == "phrasings" else self.phrasings
         if held_out == "words":  # only phrasings that have a word to replace

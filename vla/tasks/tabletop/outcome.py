@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vla.tasks.tabletop.goals.goal import Skill, Subgoal, WorldState, current
+from vla.tasks.tabletop.goals.goal import Skill, Subgoal, WorldState, current_subgoal
 
 REACH = 0.035  # distance between tool point and block centre at which a block is reached [m]
 PUSH = 0.07  # the same for a block to be pushed from its side [m]
@@ -40,7 +40,7 @@ class OutcomeClassifier:
     def update(self, state: WorldState, subgoals: Sequence[Subgoal], named: Sequence[int]) -> None:
         """Update with one step: its state, its subgoals, the indices of the named blocks."""
         self._held_for = self._held_for + 1 if all(subgoal.done for subgoal in subgoals) else 0
-        subgoal = current(subgoals)
+        subgoal = current_subgoal(subgoals)
         block, self._skill = subgoal.block, subgoal.skill
         if block != self._block:
             self._block, self._near, self._lifted, self._holding, self._dropped = block, False, False, False, False

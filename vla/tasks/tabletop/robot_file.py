@@ -30,7 +30,7 @@ Values = Annotated[dict[str, float], MinLen(1)]
 HAND = "hand_"  # in front of the names in a hand's own file
 # Settings of a model for the world around it: the tabletop's apply, and MuJoCo warns of every difference.
 OF_THE_WORLD = ("option", "authored", "visual", "stat", "memory", "nstack", "nconmax", "njmax", "nuserdata")
-LISTED = 30  # names in an error
+MAX_LISTED = 30  # names in an error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +131,7 @@ def read(file: Path, key: str) -> mujoco.MjSpec:
         setattr(spec, name, getattr(defaults, name))
     # URDF: keep shapes that do not collide, and links that do not move, of which the tool may be one.
     spec.compiler.discardvisual = spec.compiler.fusestatic = False
-    compiled(spec, label)
+    compile_model(spec, label)
     return spec
 
 
@@ -182,19 +182,19 @@ def _say(sentence: str) -> None:
     log.info("%s", sentence)
 
 
-def compiled(spec: mujoco.MjSpec, named: str = "task.robot") -> mujoco.MjModel:
-    """Compile a model that was changed; a UserError says that `named` does not compile."""
+def compile_model(spec: mujoco.MjSpec, name: str = "task.robot") -> mujoco.MjModel:
+    """Compile a model that was changed; a UserError says that `name` does not compile."""
     try:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise UserError(f"{named} does not compile: {' '.join(str(error).split())}") from error
+        raise UserError(f"{name} does not compile: {' '.join(str(error).split())}") from error
 
 
-def require(key: str, names: Iterable[str], known: Iterable[str], kind: str) -> None:
+def require(key: str, names: Iterable[str], elements: Iterable[str], kind: str) -> None:
     """Raise a UserError, which lists the known elements of this `kind`, if one of `names` is not among them."""
-    elements = [name for name in known if name]
+    element_names = [name for name in elements if name]
     for name in names:
-        if name not in elements:
-            listing = ", ".join(elements[:LISTED]) + (", …" if len(elements) > LISTED else "")
-            hint = suggestion(name, elements) or ":"
+        if name not in element_names:
+            listing = ", ".join(element_names[:MAX_LISTED]) + (", …" if len(element_names) > MAX_LISTED else "")
+            hint = suggestion(name, element_names) or ":"
             raise UserError(f"task.robot.{key} names {name}, which is no {kind}{hint} there are {listing or 'none'}")

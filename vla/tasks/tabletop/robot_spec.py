@@ -14,7 +14,7 @@ from vla.robots.cartesian import DOWN
 from vla.spec import Array
 from vla.tasks.rendering.shapes import mesh_triangles
 from vla.tasks.tabletop.robot import HIDDEN, ROBOT_CONTACT, VISIBLE, look_at, spread
-from vla.tasks.tabletop.robot_file import compiled, require
+from vla.tasks.tabletop.robot_file import compile_model, require
 
 TOOL, SERVO, WRIST = "vla_tool", "vla_servo_", "wrist"  # names of what is added
 ALIGNED = 0.9  # smallest cosine between the axes of the tool's site and forward, left, down at home
@@ -24,13 +24,13 @@ UNCOLOURED = (0.5, 0.5, 0.5, 1.0)  # what MuJoCo gives geoms without a colour
 Eq = mujoco.mjtEq
 
 
-def checked_home(spec: mujoco.MjSpec, joints: Names, home: Sequence[float]) -> dict[str, float]:
+def require_home(spec: mujoco.MjSpec, joints: Names, home: Sequence[float]) -> dict[str, float]:
     """Return joint → position at home (UserError: no such joint, one that is not a hinge or not in order, or a position
     out of its limits)."""
     require("joints", joints, (joint.name for joint in spec.joints), "joint")
     if len(home) != len(joints):
         raise UserError(f"task.robot.home has {len(home)} positions for {len(joints)} joints")
-    model = compiled(spec)
+    model = compile_model(spec)
     subtree = set(range(model.nbody))
     for name, position in zip(joints, home, strict=True):
         joint = model.joint(name)
@@ -60,7 +60,7 @@ def simplify(spec: mujoco.MjSpec, joints: Collection[str], grips: Collection[str
     Joints of neither the arm nor the hand are fixed, and their couplings removed, like lamps, cameras, planes, contact
     pairs, sensors, key frames, and materials except for their colours.
     """
-    model = compiled(spec)
+    model = compile_model(spec)
     hand = descendants(model, int(model.joint(list(joints)[-1]).bodyid[0]))
     for index, body in enumerate(spec.bodies):
         body.name, body.gravcomp = body.name or f"vla_body{index}", 1.0  # its servos carry no weight
@@ -133,10 +133,10 @@ def _simplify_geoms(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
         geom.group = VISIBLE if visible else HIDDEN
 
 
-def set_armature(spec: mujoco.MjSpec, joints: Iterable[str], least: float) -> None:
-    """Give joints a reflected inertia of their motors of at least `least` [kg m²]."""
+def set_armature(spec: mujoco.MjSpec, joints: Iterable[str], minimum: float) -> None:
+    """Give joints a reflected inertia of their motors of at least `minimum` [kg m²]."""
     for joint in map(spec.joint, joints):
-        joint.armature = max(joint.armature, least)
+        joint.armature = max(joint.armature, minimum)
 
 
 def add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, force: float | None) -> str:
@@ -151,9 +151,9 @@ def add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float,
     return SERVO + joint
 
 
-def at_home(spec: mujoco.MjSpec, home: dict[str, float]) -> tuple[mujoco.MjModel, mujoco.MjData]:
+def compile_at_home(spec: mujoco.MjSpec, home: dict[str, float]) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """Compile a model and place its joints at `home`, joint → position."""
-    model = compiled(spec)
+    model = compile_model(spec)
     data = mujoco.MjData(model)
     for name, position in home.items():
         data.joint(name).qpos[0] = position
@@ -163,7 +163,7 @@ def at_home(spec: mujoco.MjSpec, home: dict[str, float]) -> tuple[mujoco.MjModel
 
 def stiffness(spec: mujoco.MjSpec, home: dict[str, float], frequency: float) -> list[float]:
     """Return the stiffnesses [N m/rad] that give the joints a natural `frequency` [rad/s] with the arm at `home`."""
-    model, data = at_home(spec, home)
+    model, data = compile_at_home(spec, home)
     inertia = np.empty((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertia)
     return [frequency**2 * inertia[dof, dof] for dof in (model.joint(name).dofadr[0] for name in home)]
@@ -184,7 +184,7 @@ def add_tool(
         UserError: no such name, or no axes that point there.
     """
     require("tool", [name], (element.name for element in (*spec.sites, *spec.bodies)), "site or body")
-    _, data = at_home(spec, home)
+    _, data = compile_at_home(spec, home)
     site = spec.site(name)
     body = site.parent if site is not None else spec.body(name)
     origin, parent = data.site(name) if site is not None else data.body(name), data.body(body.id)
@@ -220,7 +220,7 @@ def move_tool(spec: mujoco.MjSpec, shift: Array) -> None:
 
 def use_convex_hulls(spec: mujoco.MjSpec) -> None:
     """Draw the convex hull of a few vertices in place of every mesh; collisions stay as they are."""
-    model, hulls = compiled(spec), dict[str, bool]()
+    model, hulls = compile_model(spec), dict[str, bool]()
     for geom in [geom for geom in spec.geoms if geom.group == VISIBLE and geom.meshname]:
         hull = f"vla_hull_{geom.meshname}"
         if hull not in hulls:

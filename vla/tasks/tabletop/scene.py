@@ -10,7 +10,7 @@ import numpy as np
 from dm_control import mjcf
 
 from vla.tasks.tabletop.robot import PHYSICS, VISIBLE, TabletopRobot, attributes, camera
-from vla.tasks.tabletop.robot_file import compiled
+from vla.tasks.tabletop.robot_file import compile_model
 
 ColourName = Literal["red", "green", "blue", "yellow", "purple", "orange"]
 COLOURS: dict[ColourName, tuple[float, float, float]] = {
@@ -49,7 +49,7 @@ def compile_scene(robot: TabletopRobot, blocks: int, shadows: bool) -> mujoco.Mj
         body.add("geom", name=name, type="box", size=(BLOCK_HALF_SIZE,) * 3, group=VISIBLE, **material)
     spec = _export(scene)
     robot.complete(spec)
-    return compiled(spec)
+    return compile_model(spec)
 
 
 def _export(scene: mjcf.RootElement) -> mujoco.MjSpec:

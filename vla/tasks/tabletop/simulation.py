@@ -15,9 +15,9 @@ from vla.robots.cartesian import CartesianController, solve
 from vla.spec import FIRST_SEED, Array, Spec
 from vla.tasks.tabletop.compiled_scene import CompiledScene
 from vla.tasks.tabletop.disturber import PUSH_STEP, Disturber
-from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState, current
+from vla.tasks.tabletop.goals.goal import SKILLS, Goal, Referents, WorldState, current_subgoal
 from vla.tasks.tabletop.goals.several import Chain, Mixed
-from vla.tasks.tabletop.language import HeldOut
+from vla.tasks.tabletop.language import HeldOutKind
 from vla.tasks.tabletop.outcome import OutcomeClassifier
 from vla.tasks.tabletop.randomize.episode import paraphrase
 from vla.tasks.tabletop.randomize.randomizer import Randomizer
@@ -136,7 +136,7 @@ class Simulation:
         self.name, self.requests = self.goal.name, [self.requests[self.current]]
         self._start()
 
-    def _draw_held_out(self, goal: Goal, random_state: np.random.RandomState, seed: int) -> HeldOut | None:
+    def _draw_held_out(self, goal: Goal, random_state: np.random.RandomState, seed: int) -> HeldOutKind | None:
         """Draw which part of the instruction is held out; None in training and in the rest of an evaluation."""
         if seed < FIRST_SEED or random_state.uniform() >= self.compiled.held_out:
             return None
@@ -145,14 +145,14 @@ class Simulation:
         kinds = [kind for kind in goal.language.held_out_kinds if kind != "combinations" or candidates]
         return kinds[random_state.randint(len(kinds))] if kinds else None
 
-    def _adapt_held_out(self, goal: Goal, referents: Referents, kind: HeldOut | None) -> HeldOut | None:
+    def _adapt_held_out(self, goal: Goal, referents: Referents, kind: HeldOutKind | None) -> HeldOutKind | None:
         """Adapt the drawn kind of held-out instruction to another named block, so that exactly one kind applies."""
         novel = self.compiled.block_names[referents.blocks[0]] in goal.language.held_out_colours
         if novel == (kind == "combinations"):
             return kind
         return "combinations" if novel else next((k for k in goal.language.held_out_kinds if k != "combinations"), None)
 
-    def _choose(self, goal: Goal, held_out: HeldOut | None, random_state: np.random.RandomState) -> Referents:
+    def _choose(self, goal: Goal, held_out: HeldOutKind | None, random_state: np.random.RandomState) -> Referents:
         """Draw the named blocks and pads; the first block has a colour that the instruction may name."""
         colours, names = goal.language.held_out_colours, self.compiled.block_names
         order = [int(index) for index in random_state.permutation(self.compiled.present)]
@@ -260,7 +260,7 @@ class Simulation:
         if self.classifier.success and self.current + 1 < len(self.requests):
             self._begin(self.current + 1)
             subgoals = self.goal.subgoals(state, self.referents)
-        if self.disturber and not self.over and self.disturber.update(self._steps, state, current(subgoals)):
+        if self.disturber and not self.is_over and self.disturber.update(self._steps, state, current_subgoal(subgoals)):
             mujoco.mj_step1(self.compiled.model, self.compiled.data)  # poses and contacts after the move
             self._cached = None
 
@@ -296,7 +296,7 @@ class Simulation:
         faces: cosine and sine of four times the yaw from the fingers to the block's faces, invariant to quarter turns.
         """
         compiled, state, pose = self.compiled, self.world_state(), self.controller.pose
-        subgoal = current(self.goal.subgoals(state, self.referents))
+        subgoal = current_subgoal(self.goal.subgoals(state, self.referents))
         block = compiled.data.geom_xmat[compiled.block_geoms[subgoal.block]].reshape(3, 3)
         edge = block[:, int(np.argmin(np.abs(block[2])))]  # the most horizontal edge, for any face up
         quarters = 4 * (np.arctan2(edge[1], edge[0]) - np.arctan2(pose[1, 0], pose[0, 0]))
@@ -316,6 +316,6 @@ class Simulation:
         }
 
     @property
-    def over(self) -> bool:
+    def is_over(self) -> bool:
         """True if the goal was reached and held, or its time is up."""
         return self.classifier.success or self._periods >= self._most_periods

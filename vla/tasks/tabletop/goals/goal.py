@@ -68,21 +68,21 @@ class Arrangement:
     spots: Mapping[int, Spot] = field(default_factory=dict)  # block → where it is
     held: int | None = None  # block in the gripper
 
-    def stacked(self, block: int) -> bool:
+    def is_stacked(self, block: int) -> bool:
         """Return whether a block stands on another one."""
         return block in self.spots and self.spots[block][0] == "block"
 
-    def allows(self, block: int) -> bool:
+    def can_grasp(self, block: int) -> bool:
         """Return whether the gripper can take a block or holds it: no other block is held, and none stands on it."""
         return self.held in (None, block) and ("block", block) not in self.spots.values()
 
-    def lifted(self, block: int) -> Arrangement:
+    def lift(self, block: int) -> Arrangement:
         """Return the arrangement with a block in the gripper."""
         return Arrangement({other: spot for other, spot in self.spots.items() if other != block}, block)
 
     def put(self, block: int, spot: Spot) -> Arrangement | None:
         """Return the arrangement with a block released at a spot; None if the spot is taken, or is on a tower."""
-        if spot in self.spots.values() or (spot[0] == "block" and self.stacked(spot[1])):
+        if spot in self.spots.values() or (spot[0] == "block" and self.is_stacked(spot[1])):
             return None
         return Arrangement({**self.spots, block: spot})
 
@@ -98,7 +98,7 @@ class Subgoal:
     tolerance: float = 0.02  # horizontal distance from the destination at which to release the block [m]
 
 
-def current(subgoals: Sequence[Subgoal]) -> Subgoal:
+def current_subgoal(subgoals: Sequence[Subgoal]) -> Subgoal:
     """Return the first subgoal that is not done, or the last one."""
     return next((subgoal for subgoal in subgoals if not subgoal.done), subgoals[-1])
 

@@ -35,8 +35,8 @@ class Lift(Goal):
     def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
         """See `Goal`."""
         (block,) = referents.blocks
-        possible = arrangement.held is None and arrangement.allows(block)
-        return arrangement.lifted(block) if possible else None
+        possible = arrangement.held is None and arrangement.can_grasp(block)
+        return arrangement.lift(block) if possible else None
 
 
 class PickPlace(Goal):
@@ -77,7 +77,7 @@ class Place(PickPlace):
     def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
         """See `Goal`."""
         (block,), (pad, _) = referents.blocks, referents.pads
-        return arrangement.put(block, ("pad", pad)) if arrangement.allows(block) else None
+        return arrangement.put(block, ("pad", pad)) if arrangement.can_grasp(block) else None
 
 
 class Push(Goal):
@@ -101,7 +101,7 @@ class Push(Goal):
     def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
         """See `Goal`: the block must stand on the table, and the gripper be empty."""
         (block,), (pad, _) = referents.blocks, referents.pads
-        possible = arrangement.held is None and arrangement.allows(block) and not arrangement.stacked(block)
+        possible = arrangement.held is None and arrangement.can_grasp(block) and not arrangement.is_stacked(block)
         return arrangement.put(block, ("pad", pad)) if possible else None
 
 
@@ -123,7 +123,7 @@ class Stack(Goal):
     def after(self, arrangement: Arrangement, referents: Referents) -> Arrangement | None:
         """See `Goal`: towers have two blocks."""
         upper, lower = referents.blocks
-        return arrangement.put(upper, ("block", lower)) if arrangement.allows(upper) else None
+        return arrangement.put(upper, ("block", lower)) if arrangement.can_grasp(upper) else None
 
 
 class Stay(Goal):
@@ -137,7 +137,7 @@ class Stay(Goal):
     @classmethod
     def instead_of(cls, goal: Goal) -> Stay:
         """Return the goal with the instructions of another one, except that their first block is absent."""
-        return cls(goal.language.renamed({"block": "absent", "other": "block"}), goal.pads)
+        return cls(goal.language.rename({"block": "absent", "other": "block"}), goal.pads)
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
         """Keep every block in place and the arm at rest."""

@@ -13,7 +13,7 @@ from annotated_types import Ge, Le, MinLen, Predicate
 from vla.io.errors import UserError
 from vla.io.types import CountRange, NonNegative, PositiveRange, Share, ascending, unique
 from vla.tasks.tabletop.compiled_scene import CompiledScene
-from vla.tasks.tabletop.randomize.randomizer import Angles, Places, rounded
+from vla.tasks.tabletop.randomize.randomizer import Angles, Places, round_values
 from vla.tasks.tabletop.scene import COLOURS, PAD_RADIUS, PADS, ColourName
 
 ShapeName = Literal["cube", "cylinder", "tall", "flat"]
@@ -56,7 +56,7 @@ class Colours:
         tint = random_state.uniform(-self.jitter, self.jitter, (count, 3))
         rgb = np.clip([COLOURS[name] for name in names] + tint, 0, 1)
         scene.paint_blocks(names, rgb)
-        return {"names": names, "rgb": rounded(rgb)}
+        return {"names": names, "rgb": round_values(rgb)}
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Sizes:
         sizes = random_state.uniform(*self.half_size, len(scene.block_geoms))
         for index, half_size in enumerate(sizes):
             scene.set_block(index, np.full(3, half_size))
-        return {"half_size": rounded(sizes)}
+        return {"half_size": round_values(sizes)}
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class Masses:
         """Draw a factor per block."""
         factors = random_state.uniform(*self.factor, len(scene.block_geoms))
         scene.scale_density(factors)
-        return {"factor": rounded(factors)}
+        return {"factor": round_values(factors)}
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class Friction:
         sliding = random_state.uniform(*self.sliding, len(scene.block_geoms))
         scene.model.geom_friction[scene.block_geoms, 0] = sliding
         scene.model.geom_friction[scene.model.geom("table").id, 0] = sliding.min()
-        return {"sliding": rounded(sliding)}
+        return {"sliding": round_values(sliding)}
 
 
 @dataclass(frozen=True)
@@ -144,10 +144,10 @@ class Placement:
         for index, (x, y) in enumerate(blocks):
             scene.place_block(index, x, y, yaws[index])
         return {
-            "pad": rounded(np.array(pads[0])),
-            "pads": rounded(np.array(pads)),
-            "blocks": rounded(np.array(blocks)),
-            "yaw": rounded(yaws),
+            "pad": round_values(np.array(pads[0])),
+            "pads": round_values(np.array(pads)),
+            "blocks": round_values(np.array(blocks)),
+            "yaw": round_values(yaws),
         }
 
     def _scatter(self, radii: Sequence[float], random_state: np.random.RandomState) -> list[tuple[float, float]]:

@@ -32,6 +32,6 @@ class Randomizer(Protocol):
         """Sample, write the sample into the compiled model or the state, and return it as plain values."""
 
 
-def rounded(values: Array) -> list[Any]:
+def round_values(values: Array) -> list[Any]:
     """Round to five decimals."""
     return np.round(values, 5).tolist()

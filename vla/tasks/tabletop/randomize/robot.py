@@ -10,7 +10,7 @@ import numpy as np
 from vla.io.types import NonNegativeRange, PositiveRange, Share
 from vla.robots.cartesian import DOWN, rotation_z, solve
 from vla.tasks.tabletop.compiled_scene import CompiledScene, Noise
-from vla.tasks.tabletop.randomize.randomizer import Angles, Lengths, Places, rounded
+from vla.tasks.tabletop.randomize.randomizer import Angles, Lengths, Places, round_values
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Arm:
         target[:3, 3], target[:3, :3] = position, rotation_z(yaw) @ DOWN
         arm = scene.robot.kinematics
         scene.place_arm(solve(arm, target, arm.home), opening)
-        return {"tcp": rounded(position), "yaw": round(yaw, 5), "opening": round(opening, 5)}
+        return {"tcp": round_values(position), "yaw": round(yaw, 5), "opening": round(opening, 5)}
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class RobotColour:
         factor = random_state.uniform(*self.shade) + random_state.uniform(-self.tint, self.tint, 3)
         rgb = scene.model.geom_rgba[scene.robot_geoms, :3] * factor
         scene.model.geom_rgba[scene.robot_geoms, :3] = np.clip(rgb, 0, 1)
-        return {"factor": rounded(factor)}
+        return {"factor": round_values(factor)}
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Gains:
         factors = random_state.uniform(*self.factor, len(scene.arm_actuators))
         scene.model.actuator_gainprm[scene.arm_actuators, 0] *= factors
         scene.model.actuator_biasprm[scene.arm_actuators, 1:3] *= factors[:, None]
-        return {"factor": rounded(factors)}
+        return {"factor": round_values(factors)}
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from annotated_types import Ge, Le
 from vla.io.types import NonNegativeRange, Share
 from vla.spec import Array
 from vla.tasks.tabletop.compiled_scene import CompiledScene
-from vla.tasks.tabletop.randomize.randomizer import Angle, Length, Shares, rounded
+from vla.tasks.tabletop.randomize.randomizer import Angle, Length, Shares, round_values
 from vla.tasks.tabletop.scene import LAMP_DISTANCE, SHADOWED, TEXTURE
 
 PATTERNS = ("checks", "stripes", "patches")
@@ -34,7 +34,7 @@ class Light:
         scene.model.light_diffuse[0] = diffuse
         scene.model.light_dir[0] = direction / np.linalg.norm(direction)
         scene.model.light_pos[0] = np.array(SHADOWED) - LAMP_DISTANCE * scene.model.light_dir[0]
-        return {"diffuse": rounded(diffuse), "direction": rounded(scene.model.light_dir[0])}
+        return {"diffuse": round_values(diffuse), "direction": round_values(scene.model.light_dir[0])}
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class Cameras:
             scene.model.cam_fovy[camera] += self.fovy * zoom
             scene.turn_camera(camera, self.rotation * turn)
             draws[name] = {
-                "position": rounded(self.position * shift),
-                "rotation": rounded(self.rotation * turn),
+                "position": round_values(self.position * shift),
+                "rotation": round_values(self.rotation * turn),
                 "fovy": round(self.fovy * zoom, 3),
             }
         return draws
@@ -76,7 +76,7 @@ class Colour:
         """Draw a colour, which the tint may move beyond 0…1; the surface shows the nearest one within."""
         rgb = random_state.uniform(*self.brightness) + random_state.uniform(-self.tint, self.tint, 3)
         scene.model.geom_rgba[scene.model.geom(self.surface).id, :3] = np.clip(rgb, 0, 1)
-        return {"rgb": rounded(rgb)}
+        return {"rgb": round_values(rgb)}
 
 
 class Table(Colour):
@@ -105,7 +105,7 @@ class Texture:
         weights = _pattern(kind, random_state)[:, :, None]  # (H, W, 1) 0…1
         picture = 255 * (1 - weights + weights * shade)
         scene.paint_texture(self.surface, picture.astype(np.uint8))
-        return {"kind": kind, "shade": rounded(shade)}
+        return {"kind": kind, "shade": round_values(shade)}
 
 
 def _pattern(kind: str, random_state: np.random.RandomState) -> Array:
