@@ -61,7 +61,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", default=[*FIGURES], metavar="FIGURES", help=", ".join(FIGURES))
     parser.add_argument("--against", type=Path)
-    asked = parser.parse_args()
+    asked = parser.parse_intermixed_args()
     asked.folder.mkdir(parents=True)
     found = {f"{name} of {of}": value for name in asked.names for of, value in FIGURES[name](asked.folder.resolve())}
     (asked.folder / "behaviours.json").write_text(json.dumps(found, indent=1))
