@@ -178,6 +178,8 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
         EpisodeStore(damaged("depth_wrist.bin", lambda data: data[:-1]))
     with pytest.raises(ValueError, match=r"line 2 of .*index\.jsonl does not follow"):
         EpisodeStore(damaged("index.jsonl", lambda data: data.split(b"\n")[0] + b"\n" + data))
+    with pytest.raises(ValueError, match="has no field 'rgb': it has action, depth_front"):
+        EpisodeStore(whole).rows("rgb")
 
 
 @pytest.mark.parametrize("name", ["index.jsonl", "executed.bin", "rgb_front.bin"])

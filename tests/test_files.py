@@ -55,10 +55,11 @@ def test_only_what_a_disk_says_is_put_in_other_words(tmp_path: Path) -> None:
 
 
 def test_what_killed_processes_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
-    others = ["last.ckpt", "policy", ".training", ".0123abcd.other.ckpt", ".0123abcd.policy.before"]
+    others = ["last.ckpt", "policy", ".training", ".0123abcd.other.ckpt", ".0123abcd.policy.before", ".0123abcd.run1"]
     for name in (*others, ".0123abcd.last.ckpt", ".0123abcd.policy"):
         if "policy" in name:
             (tmp_path / name).mkdir()
         (tmp_path / name / "model" if "policy" in name else tmp_path / name).touch()
-    remove_drafts(tmp_path / "last.ckpt", tmp_path / "policy", tmp_path / "missing" / "policy")
+    (tmp_path / ".0123abcd.run[1]").touch()
+    remove_drafts(*(tmp_path / name for name in ("last.ckpt", "policy", "missing/policy", "run[1]")))
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)

@@ -15,7 +15,7 @@ from collecting import content
 from command_line import SMALL
 from composing import composed
 from toy import ARM_SPEC, make_arm, make_environment, make_expert
-from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, flip
+from toy_episodes import CODECS, CONFIG, EPISODES, MORE, add, change, flip, full_disk
 
 from vla.config.experiment import Experiment
 from vla.config.nodes import Inspection
@@ -201,6 +201,8 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path: Path) -> None:
     change(store.folder / "action.bin", lambda data: flip(data, len(data) - 1))
     with pytest.raises(ValueError, match=r"the rows of seed 4 in .* were changed on disk: .* inspect\.repair=true"):
         derive_store([store], tmp_path / "new")
+    with full_disk(0), pytest.raises(UserError, match=r"/new cannot be written \(.*\), nothing of it is kept"):
+        derive_store([store], tmp_path / "new")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "store"]
     shutil.copytree(store.folder, tmp_path / ".0123abcd.new")  # as if killed there
     derive_store([EpisodeStore(store.folder, allow_damage=True)], tmp_path / "new", repair=True)
@@ -222,6 +224,22 @@ def test_two_processes_do_not_write_one_new_store(tmp_path: Path, monkeypatch: p
     derive_store([store], tmp_path / "inner/new")
     assert verify_store(EpisodeStore(tmp_path / "inner/new")).intact_entries == store.episodes
     assert [path.name for path in (tmp_path / "inner").iterdir()] == ["new"]
+
+
+def test_a_folder_that_is_made_while_a_new_store_is_written_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = add(tmp_path / "store", EPISODES)
+
+    def meanwhile(items: list[Any], description: str) -> list[Any]:
+        add(tmp_path / "new", EPISODES[:1])
+        return items
+
+    monkeypatch.setattr("vla.data.derivation.track", meanwhile)
+    with pytest.raises(UserError, match="new exists already and is left alone"):
+        derive_store([store], tmp_path / "new")
+    assert EpisodeStore(tmp_path / "new").episodes == store.episodes[:1]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "store"]
 
 
 def test_a_seed_that_is_not_there_is_named(tmp_path: Path) -> None:

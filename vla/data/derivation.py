@@ -44,8 +44,7 @@ def derive_store(
     message = f"another process writes {folder}: wait for it, or choose another inspect.into"
     lock = try_lock(folder.with_name(f".{folder.name}.lock"), message)
     try:
-        if folder.exists():
-            raise UserError(f"{folder} exists already and is left alone: choose another inspect.into")
+        _require_new(folder)
         remove_drafts(folder)  # of a process that was killed
         codecs = {store.codec for store in stores}
         codec = Codec("lossless") if len(codecs) > 1 else codecs.pop()  # no further loss
@@ -54,8 +53,9 @@ def derive_store(
             with target.writing():
                 seeds = [(seed, copies) for part in selection.values() for seed, copies in sorted(part.items())]
                 damaged_seeds = [seed for seed, copies in track(seeds, "writing") if not _write(target, copies, repair)]
-    except UserError as error:
-        if isinstance(error.__cause__, OSError):  # its message is about a store that grows, and does not apply here
+            _require_new(folder)  # another job may have made it meanwhile, and the draft would replace it
+    except (UserError, OSError) as error:
+        if isinstance(error.__cause__, OSError):  # its message is about a store that grows, or names the draft
             reason = f"{folder} cannot be written ({error.__cause__.strerror}), nothing of it is kept"
             raise UserError(f"{reason}: make room there, or choose another inspect.into") from error
         raise
@@ -63,6 +63,11 @@ def derive_store(
         Path(lock.lock_file).unlink(missing_ok=True)  # while it is held: a later process creates a new one
         lock.release()
     return damaged_seeds
+
+
+def _require_new(folder: Path) -> None:
+    if folder.exists():
+        raise UserError(f"{folder} exists already and is left alone: choose another inspect.into")
 
 
 def _choose(stores: Sequence[EpisodeStore], where: Mapping[str, Any]) -> EpisodeSelection:

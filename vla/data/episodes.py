@@ -160,9 +160,12 @@ class EpisodeStore:
     def rows(self, field: str, in_random_order: bool = False) -> Rows:
         """Return all committed rows of `field`, (N, …), which are read when they are indexed.
 
-        Compressed images, and rows of a large store that will be read `in_random_order`, are
-        `ScatteredRows`, which raise a DamageError for a damaged image. All other rows are a memory-mapped array.
+        Compressed images, and rows of a large store that will be read `in_random_order`, are `ScatteredRows`, which
+        raise a DamageError for a damaged image. All other rows are a memory-mapped array. Raises a UserError if there
+        is no such field.
         """
+        if field not in self.fields:
+            raise UserError(f"{self.folder} has no field {field!r}: it has {', '.join(sorted(self.fields))}")
         column = self.fields[field]
         if self._rows == 0:  # an empty file cannot be mapped
             return np.empty((0, *column.shape), column.dtype)
