@@ -205,6 +205,12 @@ def test_an_environment_that_cannot_be_built_ends_the_evaluation(workers: int) -
         evaluate(toy.make_impossible_environment, toy.make_agent, None, SEEDS[:2], Cluster(workers, "beside"))
 
 
+def test_seeds_of_training_are_refused() -> None:
+    for seeds in (range(0), range(FIRST_SEED - 1, FIRST_SEED + 1)):
+        with pytest.raises(ValueError, match="seeds from 1000000 on"):
+            evaluate(toy.make_environment, toy.make_agent, None, seeds)
+
+
 def test_libraries_use_one_thread_while_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
     import torch
 

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from vla.io.errors import counted
+from vla.io.errors import UserError, counted
 from vla.io.progress import Bar
 from vla.parallel.pool import THIS_PROCESS, Cluster, Future, Pool, WorkerCrash
 from vla.rollouts.motion import motion_of
@@ -22,7 +22,7 @@ from vla.rollouts.recordings import Recordings, choose_results
 from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory, close_agent
 from vla.rollouts.worlds import Stage, as_agents, play
-from vla.spec import Agent, Agents, Environment, Episode, Recorder
+from vla.spec import FIRST_SEED, Agent, Agents, Environment, Episode, Recorder
 
 log = logging.getLogger(__name__)
 
@@ -56,8 +56,11 @@ def evaluate(
     does not depend on the number of workers.
 
     Episodes whose seeds are in `known_results`, seed → result, are not played again. `on_result` is called with every
-    new result but errors. Raises a UserError if the cluster raises one.
+    new result but errors. Raises a UserError if there are no seeds, seeds are in the range of collection, or the
+    cluster raises one.
     """
+    if not seeds or min(seeds) < FIRST_SEED:
+        raise UserError(f"evaluation needs seeds from {FIRST_SEED} on, which no policy is trained on; got {seeds}")
     make = partial(_RolloutWorker, make_environment, make_agent, None if recordings == 0 else make_recorder, lanes)
     record_all, score = recordings == "all", _Score(seeds, dict(known_results or {}), until, turns)
     with cluster.pool(make) as pool:
