@@ -89,6 +89,8 @@ def test_rt1_has_fixed_bounds_by_unit_and_rounds_down() -> None:
 def test_what_does_not_fit_the_actions_is_refused() -> None:
     with pytest.raises(UserError, match="rt1 takes actions in m, rad, 1, not in kg"):
         RT1Bins(spec=replace(SPEC, units=("m", "m", "kg")), **defaults_of("tokenizer/rt1"))
+    with pytest.raises(UserError, match="2 components, the spec has 3: x, y, gripper"):
+        Uniform(spec=SPEC, statistics=between([0.0, 0.0], [1.0, 1.0]), **defaults_of("tokenizer/uniform"))
     for spec in (replace(SPEC, low=(-0.05, 0.05, 0.0)), replace(SPEC, high=(0.05, float("inf"), 1.0))):
         with pytest.raises(UserError, match="the spec must give y finite bounds"):
             Uniform(spec=spec, statistics=BOUNDS, **defaults_of("tokenizer/uniform"))

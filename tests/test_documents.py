@@ -95,5 +95,5 @@ def test_a_configuration_out_of_a_file_is_plain_and_resolved() -> None:
 
 def test_half_a_character_is_refused_before_anything_is_made_of_it(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text('{"learner": ["\\ud800"]}')
-    with pytest.raises(UserError, match=r"config\.json is damaged or of another kind: .*hex escape"):
+    with pytest.raises(UserError, match=r"config\.json is damaged or of another kind: .*surrogates not allowed"):
         read_resolved(tmp_path / "config.json")

@@ -74,6 +74,8 @@ def test_a_reader_can_keep_to_the_first_episodes(tmp_path: Path) -> None:
         EpisodeStore(tmp_path, episodes=9)
     empty = add(tmp_path / "empty", [])
     assert empty.episodes == [] and empty.next_seed is None and empty.rows("rgb_front").shape == (0, 16, 16, 3)
+    with pytest.raises(ValueError, match="no episodes yet"):
+        _ = empty.statistics
 
 
 TEARS: dict[str, tuple[float, float, float]] = {  # share of the last episode in one file, in the others, in the index

@@ -83,7 +83,7 @@ def test_an_import_goes_on_where_it_was(home: Path, tmp_path: Path) -> None:
     imported(home / "dataset", tmp_path / "store", episodes=1)
     imported(home / "dataset", tmp_path / "store")
     assert content(tmp_path / "store") == content(home / "imported")
-    with pytest.raises(ValueError, match=r"only 3 whole episodes: set collect\.episodes=3"):
+    with pytest.raises(ValueError, match=r"only 3 recorded episodes: set collect\.episodes=3"):
         imported(home / "dataset", tmp_path / "store", episodes=4)
 
 

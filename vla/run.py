@@ -31,6 +31,7 @@ from vla.config.experiment import Experiment
 from vla.config.packages import config_folders, offer_options, trust
 from vla.deploy import ros
 from vla.io.errors import UserError, suggestion
+from vla.io.files import warn_on_error
 from vla.io.printable import escape
 from vla.parallel.processes import ease_garbage_collection, spin_briefly, without_triton
 
@@ -41,12 +42,8 @@ PICKLE = "--experimental-rerun"  # option of Hydra
 OPTIONS = (PICKLE, "--cfg", "--config-dir", "--config-name", "--config-path", "--info", "--package")  # with values
 # Errors of a command line, a file or a machine.
 EXPECTED_ERRORS = (UserError, OSError, HydraException, OmegaConfBaseException, YAMLError, RecursionError)
-RESUMABLE_JOBS = (
-    "collect",
-    "train",
-    "evaluate",
-    "improve",
-)  # jobs that go on where an earlier one ended, in its folder
+# Jobs that go on where an earlier one ended, in its folder.
+RESUMABLE_JOBS = ("collect", "train", "evaluate", "improve")
 RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")  # variables that Lightning reads on its import
 TRACEBACKS = "VLA_TRACEBACKS"  # environment variable that passes the user's HYDRA_FULL_ERROR to child processes
 
@@ -203,7 +200,6 @@ def _end(error: Exception) -> NoReturn:
     """End the program with an error of one sentence, unless it is a bug or the user wants its traceback."""
     for note in getattr(error, "__notes__", ()):
         if note.startswith(SWEEP):
-            from vla.io.files import warn_on_error
             from vla.jobs.sweep import write_table
             from vla.runs.sweep import describe_failures
 

@@ -149,7 +149,8 @@ class EpisodeStore:
 
     @property
     def statistics(self) -> ActionStatistics:
-        """Bounds and a sample of the actions in `episodes`, at least one; a UserError if they are damaged."""
+        """Bounds and a sample of the actions in `episodes`; a UserError if there are none, or if they are damaged."""
+        self.require_episodes()
         self.verify(self.episodes, {"action": self.rows("action")})
         return ActionStatistics(self.numbers("action"), np.array([entry.end for entry in self.episodes]))
 

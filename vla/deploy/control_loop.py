@@ -248,7 +248,7 @@ class ControlLoop:
         elif self.safety.instruction is not None and now - self._instructed_at > self.safety.instruction:
             self.stop(f"time-out: {self.safety.instruction:g} s on one instruction", "send the next instruction")
             self._timed_out = True
-        elif problem := self._input_problem(joint_state, now):
+        elif problem := self._input_problem(now):
             # A held arm moves again only after consecutive fresh frames.
             self.observer.fresh_sets = 0
             self._set_state(State.HOLDING if self.state is State.RUNNING else self.state, problem)
@@ -268,7 +268,7 @@ class ControlLoop:
         resting = self.motion.limiter.resting and self.observer.displacement(REST_TIME) <= REST_MOTION
         return self.state is State.STOPPED or (self.state is State.FAULT and resting)
 
-    def _input_problem(self, joint_state: JointMeasurement, now: float) -> str:
+    def _input_problem(self, now: float) -> str:
         """Describe which input or inference is overdue; empty if none is."""
         if problem := self.obstacle or self.observer.image_problem(now, self.safety.image_age):
             return problem

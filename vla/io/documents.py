@@ -118,8 +118,23 @@ def resolve_config(value: Any, name: str) -> Any:
 
 
 def read_resolved(path: Path) -> Any:
-    """Read the JSON file at `path` as a configuration, see `read_json` and `resolve_config`."""
-    return resolve_config(read_json(path, Any, MAX_RESOLVED_BYTES), str(path))
+    """Read the JSON file at `path` as a configuration, see `resolve_config`.
+
+    Also raises a UserError if a key occurs twice, or a text has a lone surrogate, which could not be written again.
+    """
+
+    def unique_mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(mapping := dict(pairs)) < len(pairs):
+            raise UserError("a mapping has one key twice")
+        return mapping
+
+    try:
+        text = read_bounded(path, MAX_RESOLVED_BYTES)
+        value = json.loads(text, object_pairs_hook=unique_mapping, parse_constant=int)  # int("NaN") raises a ValueError
+        json.dumps(value, ensure_ascii=False).encode()
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path} is damaged or of another kind: {str(error)[:200]}") from error
+    return resolve_config(value, str(path))
 
 
 def mappings(value: Any) -> Iterator[dict[Any, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import logging
 import os
@@ -10,7 +11,6 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from errno import EACCES, EDQUOT, EFBIG, EISDIR, ENOSPC, ENOTDIR, EPERM, EROFS
-from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,7 +57,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
 def remove_drafts(*targets: Path) -> None:
     """Remove drafts of `atomic_path` that killed processes left; no other process may write these targets meanwhile."""
     for target in targets:
-        for draft in target.parent.glob(f".{'[0-9a-f]' * 8}.{escape(target.name)}"):
+        for draft in target.parent.glob(f".{'[0-9a-f]' * 8}.{glob.escape(target.name)}"):
             shutil.rmtree(draft, ignore_errors=True)
             with suppress(OSError):  # it was a folder
                 draft.unlink()

@@ -72,7 +72,7 @@ def run(experiment: Experiment) -> float | None:
     if checkpoint is agent is None:
         return None
     if experiment.playable:
-        return evaluate_checkpoint(experiment, checkpoint)
+        return evaluate_closed_loop(experiment, checkpoint)
     from vla.jobs.open_loop import evaluate_open_loop  # imports Lightning, which takes seconds, as training does
 
     return evaluate_open_loop(experiment, checkpoint)
@@ -89,7 +89,7 @@ def _train(experiment: Experiment) -> Path | None:
     return None
 
 
-def evaluate_checkpoint(experiment: Experiment, checkpoint: Path | None) -> float:
+def evaluate_closed_loop(experiment: Experiment, checkpoint: Path | None) -> float:
     """Return the success rate of a policy, or of the agent of the config.
 
     A finished evaluation of a policy is not repeated, and an unfinished one continues after the episodes that were

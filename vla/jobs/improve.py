@@ -24,7 +24,7 @@ from vla.data.header import is_store
 from vla.data.index import format_numbers
 from vla.io.errors import UserError, counted
 from vla.jobs.collect import complete_store, demonstrations
-from vla.jobs.evaluate import agents_for_workers, evaluate_checkpoint, require_possible
+from vla.jobs.evaluate import agents_for_workers, evaluate_closed_loop, require_possible
 from vla.jobs.train import train
 from vla.models.policy_folder import read_policy
 from vla.rollouts.collect import collect
@@ -66,7 +66,7 @@ def _improve(experiment: Experiment, seeds: range) -> float:
         successes = sum(entry.success for entry in store.episodes)
         log.info("round %d: success in %d of %s", number, successes, counted(len(store.episodes), "labelled episode"))
         checkpoint = _train(_round(experiment, checkpoint, folder, stores))
-    return evaluate_checkpoint(experiment, checkpoint)
+    return evaluate_closed_loop(experiment, checkpoint)
 
 
 def _save_config(experiment: Experiment) -> None:

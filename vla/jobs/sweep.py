@@ -18,9 +18,7 @@ if TYPE_CHECKING:
     from vla.runs.sweep import SweepRow
 
 LOCK = ".lock"  # in the folder of a sweep
-TABLE_INTERVAL = (
-    10  # up to so many ended cells each one updates the table, then every tenth, because it reads all cells
-)
+TABLE_INTERVAL = 10  # up to so many ended cells each one updates the table, then every tenth: it reads all cells
 
 
 class SweepTable(Callback):

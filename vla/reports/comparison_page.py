@@ -150,6 +150,6 @@ def _config_differences(runs: Mapping[str, Run]) -> Table:
 
 
 def _failures(name: str, run: Run) -> Section:
-    failures = [result for result in run.report.per_episode if not result.success] if run.report else []
-    pictures = moving_pictures(failures, run.folder / RECORDINGS)
+    failed = [result for result in run.report.per_episode if not result.success] if run.report else []
+    pictures = moving_pictures(failed, run.folder / RECORDINGS)
     return Section(f"Failures of {name}", rollouts=pictures[:FAILURES])

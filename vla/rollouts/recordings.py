@@ -20,10 +20,8 @@ Recordings = Literal["all", "failures"] | int
 
 SUCCESSES = 10  # successes beside the failures
 FAILURES_SHOWN, SUCCESSES_SHOWN = 6, 3  # moving pictures
-MAX_BYTES, MAX_RECORDINGS = (
-    1 << 29,
-    2000,
-)  # limits of a file, [bytes] and recordings: merging takes seven times its size in memory
+# Limits of a file, [bytes] and recordings: merging takes seven times its size in memory.
+MAX_BYTES, MAX_RECORDINGS = 1 << 29, 2000
 SUFFIXES = (".rrd", ".webp")  # of a recording and of a moving picture
 
 

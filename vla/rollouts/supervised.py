@@ -14,6 +14,7 @@ class SupervisedAgent:
 
     def __init__(self, policy: Agent, expert: Agent) -> None:
         """Let an expert, see `require_memoryless`, label what a policy sees."""
+        require_memoryless(expert)
         self._policy, self._expert = policy, expert
         self.info: dict[str, Any] = {}
 

@@ -28,9 +28,7 @@ from vla.training.device import memory_of
 log = logging.getLogger(__name__)
 
 ROOM = 3  # memory of a process with a model, as a multiple of its weights: they arrive pickled, and the model acts
-GPU_PROCESS_MEMORY = (
-    1e9  # memory of a process that uses a GPU, without its model: of the GPU, and of the machine [bytes]
-)
+GPU_PROCESS_MEMORY = 1e9  # of the GPU, and of the machine, that a process takes without its model [bytes]
 PER_WORKER = 5  # smallest number of episodes per process; fewer would take less time than its start
 
 

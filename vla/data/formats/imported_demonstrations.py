@@ -91,6 +91,7 @@ class ImportedDemonstrations(ABC):
     def fill(self, store: EpisodeStore, episodes: int) -> int:
         """Append episodes until the store holds `episodes`; returns the number appended (UserError: there are too few,
         the store holds other ones, one is damaged, or the disk is full)."""
+        self.require_enough(episodes)
         if episodes < len(self):
             log.info("collect.episodes=%d of the %d recorded episodes are used", episodes, len(self))
         self.require_held(store)

@@ -223,10 +223,19 @@ class RT1Bins(EvenBins):
 
 
 def data_bounds(spec: Spec, statistics: ActionStatistics | None, margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return (D,) bounds: the data extended by `margin` times its range, or without data the allowed range."""
+    """Return (D,) bounds: the data extended by `margin` times its range, or without data the allowed range.
+
+    Raises:
+        UserError: the statistics have another number of components.
+    """
     allowed_low, allowed_high = np.array(spec.low), np.array(spec.high)
     low = allowed_low if statistics is None else np.asarray(statistics.low, dtype=np.float64)
     high = allowed_high if statistics is None else np.asarray(statistics.high, dtype=np.float64)
+    if low.shape != allowed_low.shape:
+        raise UserError(
+            f"the statistics describe actions of {low.size} components, the spec has {len(spec.action)}: "
+            f"{', '.join(spec.action)}"
+        )
     span = np.maximum(high - low, MIN_SPAN * (allowed_high - allowed_low))
     half_span = (0.5 + margin) * span
     return (low + high) / 2 - half_span, (low + high) / 2 + half_span

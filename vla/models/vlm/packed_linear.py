@@ -17,9 +17,8 @@ from transformers.models.siglip.modeling_siglip import SiglipMLP
 from transformers.models.smolvlm.modeling_smolvlm import SmolVLMVisionMLP
 
 PackedWeight = tuple[tuple[int, int], Tensor]  # address and version of a weight, and the weight in another layout
-PACKED_WEIGHTS: WeakKeyDictionary[nn.Module, PackedWeight] = (
-    WeakKeyDictionary()
-)  # not in the modules, which are saved and copied
+# Not in the modules, which are saved and copied.
+PACKED_WEIGHTS: WeakKeyDictionary[nn.Module, PackedWeight] = WeakKeyDictionary()
 # Fused optimisers change a weight without changing its version.
 register_optimizer_step_post_hook(lambda *_: PACKED_WEIGHTS.clear())
 

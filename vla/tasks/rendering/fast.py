@@ -178,22 +178,22 @@ class FastRenderer:
 
     def _place_elements(self) -> None:
         """Upload the elements' triangles, and store their places in the buffer."""
-        shapes, sky = self._geometry.elements, len(self._elements.kind)
-        self._buffers.update([shape.visible for shape in shapes])
-        ends = np.cumsum([0, *(shape.visible.triangles.size for shape in shapes)]).tolist()
+        placed, sky = self._geometry.elements, len(self._elements.kind)
+        self._buffers.update([shape.visible for shape in placed])
+        ends = np.cumsum([0, *(shape.visible.triangles.size for shape in placed)]).tolist()
         self._calls = {
             shape.element: DrawCall(self._texture_of(shape.element), start, shape.visible.triangles.size)
-            for shape, start in zip(shapes, ends, strict=False)
+            for shape, start in zip(placed, ends, strict=False)
         }
         order = list(self._calls)
         solid, self._transparent = order[: self._geometry.solid_count], order[self._geometry.solid_count :]
         self._opaque = np.array([element for element in solid if element != sky], int)
-        radius = {shape.element: shape.radius for shape in shapes}
+        radius = {shape.element: shape.radius for shape in placed}
         radius |= dict.fromkeys(self._planes, np.inf)  # they may move along with a camera
         self._radii = MARGIN * np.array([radius[element] for element in self._opaque])
         # Elements rarely enter or leave a picture, so the merged calls are cached for every set of visible elements.
         self._batches: dict[bytes, list[DrawCall]] = {}  # whether each opaque element is in sight → what to draw
-        self._shadows.update([shape for shape in shapes if shape.element != sky])
+        self._shadows.update([shape for shape in placed if shape.element != sky])
 
     def _texture_of(self, element: int) -> int:
         texture = self._sky if element == len(self._elements.kind) else int(self._elements.texture[element])

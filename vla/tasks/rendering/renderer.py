@@ -31,7 +31,7 @@ class Renderer(Protocol):
         """Apply all changes of the model since the last call: call it after every change, such as at resets.
 
         Args:
-            textures: ids of textures whose pixels have changed; all other changes are found by comparison.
+            textures: ids of textures whose pixels have changed; other changes need not be named.
         """
 
     def render(self, data: mujoco.MjData, windows: Array | None = None) -> tuple[Array, Array]:
