@@ -276,12 +276,15 @@ def test_workers_have_room_for_a_small_model_and_on_a_gpu_for_its_libraries(
     assert processes_that_fit(torch.device(device), 1e6) == expected
 
 
-def test_validation_finds_the_same_with_any_number_of_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("lanes", [1, 3])
+def test_validation_finds_the_same_with_any_number_of_workers(
+    lanes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     learner, seeds = make_learner(make_rt1()), range(FIRST_SEED, FIRST_SEED + 5)
     torch.backends.cuda.enable_flash_sdp(True)  # as in a new process, whatever an interrupted training before left
     learner.on_fit_start()  # what a training sets must not matter
     try:
-        with ClosedLoop(toy.Telling, as_policy, seeds, tmp_path, workers=2) as closed_loop:
+        with ClosedLoop(toy.Telling, partial(as_policy, lanes=lanes), seeds, tmp_path, workers=2) as closed_loop:
             with monkeypatch.context() as changed:
                 changed.setattr("vla.training.closed_loop.memory_of", lambda device: (0.0, 1e4))  # for no other model
                 alone = closed_loop.play(learner, seeds, 2)
@@ -292,9 +295,11 @@ def test_validation_finds_the_same_with_any_number_of_workers(tmp_path: Path, mo
             again, negated = (closed_loop.play(learner, seeds, workers) for workers in (1, 2))
     finally:
         learner.teardown("fit")
-    by_seed = sorted(shared, key=lambda result: result.seed)
-    assert by_seed == alone and all(result.draws["done"] for result in alone)
-    assert sorted(negated, key=lambda result: result.seed) == again != alone
+    alone, shared, again, negated = (
+        sorted(part, key=lambda result: result.seed) for part in (alone, shared, again, negated)
+    )
+    assert shared == alone and all(result.draws["done"] for result in alone)
+    assert negated == again != alone
     assert not active_children()
 
 

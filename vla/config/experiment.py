@@ -324,14 +324,14 @@ def make_policy(
         ) from error
 
 
-def training_policy(precision: str, model: Model) -> Policy:
+def training_policy(precision: str, lanes: int, model: Model) -> Policy:
     """Build the policy of a model in training, on the model's device and without a second compilation or an export."""
     device = next(model.parameters()).device
     if device.type == "cuda":  # make it the current one, also in a worker process
         import torch
 
         torch.cuda.set_device(device)
-    options = {"device": device.type, "precision": precision, "compile": False, "lanes": 1}
+    options = {"device": device.type, "precision": precision, "compile": False, "lanes": lanes}
     return build({"_target_": "vla.policy.Policy", **options}, "policy", model=model, spec=model.spec)
 
 

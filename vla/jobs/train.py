@@ -226,7 +226,8 @@ def _closed_loop(experiment: Experiment) -> ClosedLoop | None:
     if not experiment.playable:
         raise UserError(f"validate.episodes={len(seeds)}: nothing can be played in a recording: set it to 0")
     make_environment = experiment.make_environment(experiment.validate.changes)
-    make_policy = partial(training_policy, experiment["policy"].get("precision", "fp32"))
+    options = experiment["policy"]
+    make_policy = partial(training_policy, options.get("precision", "fp32"), options.get("lanes", 1))
     workers = experiment["cluster"].get("workers") or cores()
     return ClosedLoop(make_environment, make_policy, seeds, experiment.output, workers)
 

@@ -165,9 +165,24 @@ def _record(pool: Pool, results: Sequence[Result]) -> None:
 
 
 def play_episode(environment: Environment, agent: Agent, seed: int) -> Result:
-    """Play one episode; errors become results, so that one seed ends neither an evaluation nor a training."""
-    ((_, result),) = play([Stage(environment)], as_agents(agent), [seed], all_images=False)
-    return result_of(seed, result, environment.spec.control_hz)
+    """Play one episode, as `play_episodes`."""
+    return play_episodes([environment], agent, [seed])[0]
+
+
+def play_episodes(
+    environments: Sequence[Environment],
+    agent: Agent | Agents,
+    seeds: Sequence[int],
+    recorders: Sequence[Recorder] | None = None,
+) -> list[Result]:
+    """Play the episodes of seeds side by side in worlds of one kind, and record them if every world has a recorder.
+
+    An agent that is not `vla.spec.Agents` acts in one world only. Results are in the order in which episodes end;
+    errors become results, so that one seed ends neither an evaluation nor a training.
+    """
+    pairs = zip(environments, recorders or [None] * len(environments), strict=True)
+    results = play([Stage(*pair) for pair in pairs], as_agents(agent), seeds, all_images=recorders is not None)
+    return [result_of(seed, result, environments[0].spec.control_hz) for seed, result in results]
 
 
 def result_of(seed: int, ending: Episode | Exception, control_hz: float) -> Result:
@@ -225,15 +240,12 @@ class _RolloutWorker:
         self._agent = make_agent(environment)
         further_lanes = range(1, lanes if isinstance(self._agent, Agents) else 1)
         self._environments = [environment, *(make_environment() for _ in further_lanes)]
-        self._recorders = [_LenientRecorder(make_recorder()) if make_recorder else None for _ in self._environments]
+        self._recorders = [_LenientRecorder(make_recorder()) for _ in self._environments] if make_recorder else None
 
     def attempt(self, item: tuple[Sequence[int], bool]) -> list[Result]:
         """Play the episodes of seeds, and record them if the second part of the item says so."""
         seeds, recorded = item
-        recorders = self._recorders if recorded else [None] * len(self._recorders)
-        stages = [Stage(*pair) for pair in zip(self._environments, recorders, strict=True)]
-        results = play(stages, as_agents(self._agent), seeds, all_images=recorded)
-        return [result_of(seed, result, self._environments[0].spec.control_hz) for seed, result in results]
+        return play_episodes(self._environments, self._agent, seeds, self._recorders if recorded else None)
 
     def close(self) -> None:
         """Close the environments and the agent."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import pickle
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from vla.models.policy_folder import BEST
 from vla.parallel.limits import free_memory
 from vla.parallel.pool import Future, ProcessPool, WorkerCrash
 from vla.parallel.processes import one_thread_each
-from vla.rollouts.evaluate import play_episode
+from vla.rollouts.evaluate import play_episodes
 from vla.rollouts.results import ERROR, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import Agent, Environment
@@ -33,7 +33,7 @@ PER_WORKER = 5  # smallest number of episodes per process; fewer would take less
 
 
 class _Player:
-    """Worker that plays episodes with a copy of a model, and keeps an environment only while it plays."""
+    """Worker that plays episodes with a copy of a model, and keeps environments only while it plays."""
 
     def __init__(self, make_environment: Callable[[], Environment], make_policy: Callable[[Model], Agent]) -> None:
         self._make_environment, self._make_policy = make_environment, make_policy
@@ -43,10 +43,12 @@ class _Player:
         return self.play(pickle.loads(item[0]), item[1])
 
     def play(self, model: Model, seeds: Sequence[int]) -> list[Result]:
-        """Play the episodes of seeds with a model."""
+        """Play the episodes of seeds with a model, in as many worlds side by side as its policy has lanes."""
         policy = self._make_policy(model)
-        with closing(self._make_environment()) as environment:
-            return [play_episode(environment, policy, seed) for seed in seeds]
+        lanes = min(getattr(policy, "lanes", 1), len(seeds))
+        with ExitStack() as stack:
+            environments = [stack.enter_context(closing(self._make_environment())) for _ in range(lanes)]
+            return play_episodes(environments, policy, seeds)
 
     def close(self) -> None:
         """Do nothing: there are no resources to free."""
