@@ -117,14 +117,16 @@ def test_a_worker_is_answered_until_it_has_left_also_when_the_context_ends(monke
         assert action.result().shape == (3,)
 
 
-def test_an_error_that_cannot_be_sent_is_told() -> None:
-    class Odd(Exception): ...
+def test_a_worker_is_told_of_every_error_of_the_policy() -> None:
+    class Odd(Exception): ...  # which cannot be sent
 
     policy: Any = as_policy(make_bc())
-    policy.act = Mock(side_effect=Odd("no idea"))
-    refused = pytest.raises(RuntimeError, match="Odd: no idea")
-    with shared_policy(lambda: policy) as make_agent, closing(make_agent(ToyEnvironment())) as agent, refused:
-        agent.act(SPEC.random_observation(np.random.default_rng(0)))
+    policy.act = Mock(side_effect=[Odd("no idea"), []])
+    observation = SPEC.random_observation(np.random.default_rng(0))
+    with shared_policy(lambda: policy) as make_agent, closing(make_agent(ToyEnvironment())) as agent:
+        for words in ("Odd: no idea", "the policy gave 0 answers to 1 request"):
+            with pytest.raises(RuntimeError, match=words):
+                agent.act(observation)
 
 
 def test_the_lane_of_a_worker_that_has_left_is_the_next_ones() -> None:

@@ -218,11 +218,13 @@ class Service:
             lanes, observations, results = zip(*group, strict=True)
             plans = asyncio.get_running_loop().run_in_executor(thread, self._policy.plan, observations, lanes)
             try:
-                for result, actions in zip(results, await plans, strict=True):
-                    result.set_result(actions)
+                answers = [*zip(results, await plans, strict=True)]
             except Exception as error:
                 for result in results:
                     result.set_exception(error)
+            else:
+                for result, actions in answers:
+                    result.set_result(actions)
 
 
 def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from vla.io.errors import UserError
+from vla.io.errors import UserError, counted
 from vla.parallel.processes import make_picklable, one_thread_each
 from vla.spec import Agents, Array, Environment, Observation, RunningPlan, Spec
 
@@ -102,7 +102,11 @@ def _reset(policy: _Planner, episodes: Sequence[tuple[str, int]], lanes: Sequenc
 def _answer(call: Callable[..., Iterable[Any]], requests: Sequence[Request]) -> None:
     """Answer requests together, or one by one if an observation is refused."""
     try:
-        answers = call([request.content for request in requests], [request.lane for request in requests])
+        answers = [*call([request.content for request in requests], [request.lane for request in requests])]
+        if len(answers) != len(requests):
+            raise RuntimeError(
+                f"the policy gave {counted(len(answers), 'answer')} to {counted(len(requests), 'request')}"
+            )
     except Exception as error:  # of any kind: the worker raises it
         for request in requests:
             if isinstance(error, ValueError) and len(requests) > 1:  # then no lane has acted
