@@ -32,7 +32,7 @@ LONG_SENTENCE = " ".join(["sentence"] * 24)  # shorter instructions are padded t
 
 
 @dataclass
-class Lane:
+class _Lane:
     """The state of a policy in one episode."""
 
     seed: int  # of the episode
@@ -98,7 +98,7 @@ class Policy:
             self._encode = torch.compile(self.model.encode, mode=mode)
             self._predict_chunk = torch.compile(self.model.predict, mode=mode)
         self._low, self._high = np.array(spec.low, np.float32), np.array(spec.high, np.float32)
-        self._lanes = dict[int, Lane]()
+        self._lanes = dict[int, _Lane]()
         self.reset("", 0)
 
     def reset(self, instruction: str, seed: int, lane: int = 0) -> None:
@@ -114,7 +114,7 @@ class Policy:
             raise UserError(f"an instruction has at most {LONGEST_INSTRUCTION} characters, not {len(instruction)}")
         text = self.model.text.tokenize([instruction, *self._padding_sentences])[:1].to(self.device)
         random, frames = torch.Generator().manual_seed(seed), deque[dict[str, Tensor]](maxlen=self.history)
-        self._lanes[lane] = Lane(seed, instruction, text, random, frames)
+        self._lanes[lane] = _Lane(seed, instruction, text, random, frames)
 
     @property
     def info(self) -> dict[str, Any]:

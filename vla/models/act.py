@@ -17,7 +17,7 @@ from vla.models.layers import Batch, mean_where, transformer_decoder, transforme
 from vla.models.model import ContextModel, Prediction
 
 
-class CVAEEncoder(nn.Module):
+class _CVAEEncoder(nn.Module):
     """Encoder of the conditional VAE: robot state and action chunk → normal distribution of the latent.
 
     Args:
@@ -81,7 +81,7 @@ class ACT(ContextModel):
         self.kl_weight, self.latent = kl_weight, latent
         if kl_weight > 0:
             state = self.context.state_width
-            self.cvae_encoder = CVAEEncoder(state, components, self.chunk, width, layers, heads, latent)
+            self.cvae_encoder = _CVAEEncoder(state, components, self.chunk, width, layers, heads, latent)
             self.latent_token = nn.Linear(latent, width)
         self.token_types = nn.Embedding(self.context.length + (kl_weight > 0), width)  # type embeddings
         self.encoder = transformer_encoder(width, layers, heads)

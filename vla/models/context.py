@@ -152,7 +152,7 @@ class TokenContext(Context):
         learned_tokens: tokens per camera and frame.
         keypoints: number of keypoints in an additional token per camera; 0 omits the token.
         proprioception: add a token of the robot state.
-        frames_alone: omit `Fusion`, for a model that calls `encode` but not `forward`.
+        frames_alone: omit the fusion, for a model that calls `encode` but not `forward`.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class TokenContext(Context):
         self.proprioception = Proprioception(self.spec) if proprioception else None
         if self.proprioception:
             self.proprioception_token = nn.Linear(self.proprioception.width, width)
-        self.fusion = None if frames_alone else Fusion(history, self.per_frame, self.text_width, width)
+        self.fusion = None if frames_alone else _Fusion(history, self.per_frame, self.text_width, width)
         self.length = history * self.per_frame + 2
 
     def encode(self, batch: Batch, text: Tensor) -> Tensor:
@@ -211,7 +211,7 @@ class TokenContext(Context):
         return EncodedContext(tokens, tokens[:, -1], F.pad(padding, (0, 2)))
 
 
-class Fusion(nn.Module):
+class _Fusion(nn.Module):
     """Tokens of frames → the same with positions, the instruction, and an MLP of the newest frame and the instruction.
 
     Args:

@@ -19,7 +19,7 @@ from vla.models.model import ContextModel, Prediction
 from vla.models.tokenizers.tokenizer import ComponentTokenizer
 
 
-class CachedLayer:
+class _CachedLayer:
     """A layer of `nn.TransformerDecoder` with a key-value cache, for decoding token by token.
 
     Args:
@@ -141,7 +141,7 @@ class Decoder(ContextModel):
 
         n is L, or less if all sequences of the batch have ended.
         """
-        layers = [CachedLayer(cast("nn.TransformerDecoderLayer", layer), context) for layer in self.decoder.layers]
+        layers = [_CachedLayer(cast("nn.TransformerDecoderLayer", layer), context) for layer in self.decoder.layers]
         token_vector = context.summary.unsqueeze(1)
         ended = torch.zeros(len(token_vector), 1, dtype=torch.bool, device=token_vector.device)
         logits, tokens = [], []

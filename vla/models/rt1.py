@@ -19,7 +19,7 @@ from vla.models.layers import Batch
 from vla.models.model import ContextModel, TokenModel
 
 
-class Layer(nn.Module):
+class _Layer(nn.Module):
     """One pre-norm transformer layer whose feed-forward part is a single linear map, as in RT-1.
 
     Args:
@@ -82,7 +82,7 @@ class RT1(ContextModel, TokenModel):
         self.slots = self.chunk * len(self.spec.action)  # A
         self.positions = nn.Embedding(self.history * (tokens + self.slots), width)
         nn.init.normal_(self.positions.weight, std=position_std)
-        self.layers = nn.ModuleList(Layer(width, heads, key_width, dropout) for _ in range(layers))
+        self.layers = nn.ModuleList(_Layer(width, heads, key_width, dropout) for _ in range(layers))
         self.head = nn.Linear(width, self.tokenizer.bins)
         self.register_buffer("mask", attention_mask(self.history, tokens, self.slots), persistent=False)
 

@@ -44,7 +44,7 @@ TEXT_PARTS = {
 }
 
 
-class SentenceEncoder:
+class _SentenceEncoder:
     """A frozen network with its tokenizer and a cache of sentence vectors.
 
     It is no module, so it is neither trained nor averaged nor copied.
@@ -71,7 +71,7 @@ class SentenceEncoder:
             digest.update(path.read_bytes())
         self.sha256 = digest.hexdigest()  # of the weights
 
-    def __deepcopy__(self, memo: Any) -> SentenceEncoder:
+    def __deepcopy__(self, memo: Any) -> _SentenceEncoder:
         return self
 
     def embed(self, sentence: str) -> Tensor:
@@ -110,7 +110,7 @@ class HuggingFace(TextEncoder):
         transformers.logging.disable_progress_bar()
         self._name = name.source if isinstance(name, PackagedFile) else name
         with _folder(name) as folder:
-            self.encoder = SentenceEncoder(folder)
+            self.encoder = _SentenceEncoder(folder)
             self._revision = folder.name if folder.parent.name == "snapshots" else None  # in the hub's cache
         length = len(self.encoder.embed("a sentence"))
         self.projection = nn.Sequential(nn.LayerNorm(length), nn.Linear(length, width))

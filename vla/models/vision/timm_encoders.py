@@ -34,7 +34,7 @@ def synchronize_batch_norm(model: nn.Module) -> nn.Module:
     return convert_sync_batchnorm(model)
 
 
-class Normalize(nn.Module):
+class _Normalize(nn.Module):
     """Input normalisation of a timm network.
 
     Args:
@@ -73,7 +73,7 @@ class FilmEfficientNet(ImageEncoder):
         net = load_backbone(name, pretrained)
         if not hasattr(net, "conv_stem"):
             raise UserError(f"model.image.name={name} is no EfficientNet: model/image=timm takes any network of timm")
-        self.normalize = Normalize(net)
+        self.normalize = _Normalize(net)
         self.stem = nn.Sequential(net.conv_stem, net.bn1)
         self.blocks = nn.ModuleList(block for stage in net.blocks for block in stage)
         self.films = nn.ModuleList(FiLM(text_width, _output_channels(b), identity=True) for b in self.blocks)
@@ -127,7 +127,7 @@ class FilmBackbone(ImageEncoder):
         self.frozen = frozen
         self.normalized = "hiera" not in name  # the only family without a normalisation of feature maps
         self.backbone.requires_grad_(not frozen).train(not frozen)  # Lightning keeps the mode that it finds
-        self.normalize = Normalize(self.backbone)
+        self.normalize = _Normalize(self.backbone)
         self.projection = nn.Conv2d(stage.get("num_chs_norm", stage["num_chs"]), channels, 1, bias=False)
         self.film = FiLM(text_width, channels, identity=True)
 

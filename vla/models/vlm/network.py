@@ -71,7 +71,7 @@ class KeyValueMixin(nn.Module):
         return hidden, cache.keys, cache.values
 
 
-class LastLayer(nn.Module):
+class _LastLayer(nn.Module):
     """The last layer of a trunk, which computes only keys and values: nothing depends on its other results.
 
     Args:
@@ -82,12 +82,12 @@ class LastLayer(nn.Module):
         super().__init__()
         self.input_layernorm, self.self_attn = layer.input_layernorm, layer.self_attn
         self.self_attn.q_proj, self.self_attn.o_proj = (
-            UnusedWeights(layer.self_attn.q_proj),
-            UnusedWeights(layer.self_attn.o_proj),
+            _UnusedWeights(layer.self_attn.q_proj),
+            _UnusedWeights(layer.self_attn.o_proj),
         )
         self.post_attention_layernorm, self.mlp = (
-            UnusedWeights(layer.post_attention_layernorm),
-            UnusedWeights(layer.mlp),
+            _UnusedWeights(layer.post_attention_layernorm),
+            _UnusedWeights(layer.mlp),
         )
 
     def forward(self, hidden: Tensor, position_embeddings: Rotation, **_: Any) -> LayerOutput:
@@ -100,7 +100,7 @@ class LastLayer(nn.Module):
         return hidden, apply_rotary_pos_emb(keys, keys, *position_embeddings)[1], values
 
 
-class UnusedWeights(nn.Module):
+class _UnusedWeights(nn.Module):
     """Weights of a published policy that no action depends on, under their names and without gradients.
 
     Args:
@@ -112,7 +112,7 @@ class UnusedWeights(nn.Module):
         for name, weight in module.named_parameters(recurse=False):
             self.register_parameter(name, nn.Parameter(weight.data, requires_grad=False))
         for name, child in module.named_children():
-            self.add_module(name, UnusedWeights(child))
+            self.add_module(name, _UnusedWeights(child))
 
 
 def shorten(trunk: Any, kind: type[KeyValueMixin]) -> None:
@@ -121,7 +121,7 @@ def shorten(trunk: Any, kind: type[KeyValueMixin]) -> None:
     All layers return their keys and values; `kind` is the class that does so.
     """
     return_keys(trunk, kind)
-    trunk.layers[-1], trunk.norm = LastLayer(trunk.layers[-1]), UnusedWeights(trunk.norm)
+    trunk.layers[-1], trunk.norm = _LastLayer(trunk.layers[-1]), _UnusedWeights(trunk.norm)
 
 
 def return_keys(network: Any, kind: type[KeyValueMixin]) -> None:

@@ -23,7 +23,7 @@ PACKED_WEIGHTS: WeakKeyDictionary[nn.Module, PackedWeight] = WeakKeyDictionary()
 register_optimizer_step_post_hook(lambda *_: PACKED_WEIGHTS.clear())
 
 
-class PackedLinear(nn.Linear):
+class _PackedLinear(nn.Linear):
     """`nn.Linear` with the same parameters, which also caches its weight in oneDNN's layout for float32 inference."""
 
     def forward(self, input: Tensor) -> Tensor:
@@ -51,13 +51,13 @@ class PackedLinear(nn.Linear):
         return torch.ops.mkldnn._linear_pointwise(input, entry[1], self.bias, activation, [], approximation)
 
 
-class PackedMLP(nn.Module):
+class _PackedMLP(nn.Module):
     """The two linear maps of a layer of an image encoder, with GELU between them."""
 
     def forward(self, hidden: Tensor) -> Tensor:
         """Map (…, width) to (…, width)."""
         mlp: Any = self
-        if type(mlp.fc1) is PackedLinear:  # which LoRA may have replaced
+        if type(mlp.fc1) is _PackedLinear:  # which LoRA may have replaced
             return mlp.fc2(mlp.fc1.gelu(hidden))
         return mlp.fc2(mlp.activation_fn(mlp.fc1(hidden)))
 
@@ -69,7 +69,7 @@ def pack(network: nn.Module) -> None:
     for module in network.modules():
         if type(module) is nn.Linear:
             layer: Any = module
-            layer.__class__ = PackedLinear
+            layer.__class__ = _PackedLinear
         elif type(module) in (SiglipMLP, SmolVLMVisionMLP) and isinstance(module.activation_fn, GELUTanh):
             layer = module
-            layer.__class__ = PackedMLP
+            layer.__class__ = _PackedMLP

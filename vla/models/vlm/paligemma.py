@@ -35,7 +35,7 @@ TRUNK = (  # the same of PaliGemma alone
 HEADS = ("model.", "")  # of published names: what LeRobot saves begins with the former, what openpi saves does not
 
 
-class GemmaLayer(KeyValueMixin, GemmaDecoderLayer):
+class _GemmaLayer(KeyValueMixin, GemmaDecoderLayer):
     """A layer of Gemma."""
 
 
@@ -106,7 +106,7 @@ def _trunk(text: dict[str, Any], vision: dict[str, Any]) -> PaliGemmaModel:
     trunk = PaliGemmaModel(
         PaliGemmaConfig(vision_config=encoder, text_config=GemmaConfig(**text), projection_dim=width)
     )
-    shorten(trunk.language_model, GemmaLayer)
+    shorten(trunk.language_model, _GemmaLayer)
     return trunk
 
 
@@ -115,7 +115,7 @@ def _expert(sizes: dict[str, int]) -> GemmaModel:
     # The ids of special tokens must be within the vocabulary even so.
     expert = GemmaModel(GemmaConfig(**sizes, vocab_size=1, pad_token_id=0, bos_token_id=0, eos_token_id=0))
     del expert.embed_tokens
-    return_keys(expert, GemmaLayer)
+    return_keys(expert, _GemmaLayer)
     return expert
 
 

@@ -27,12 +27,12 @@ class PI05(PaliGemmaWithExpert):
         super().__init__(**inherited)
         config = self.expert.config
         width, numbers = config.hidden_size, range(config.num_hidden_layers)
-        layers = [AdaptiveLayer(config, number) for number in numbers]
+        layers = [_AdaptiveLayer(config, number) for number in numbers]
         for layer in layers:
             layer.self_attn.apply(self.expert._init_weights)
             layer.mlp.apply(self.expert._init_weights)
         self.expert.layers = nn.ModuleList(layers)
-        self.expert.norm = AdaptiveNorm(width, config.rms_norm_eps)
+        self.expert.norm = _AdaptiveNorm(width, config.rms_norm_eps)
         self.time_mlp_in, self.time_mlp_out = nn.Linear(width, width), nn.Linear(width, width)
 
     def velocity(self, prefix: Prefix, noisy: Tensor, time: Tensor) -> Tensor:
@@ -46,7 +46,7 @@ class PI05(PaliGemmaWithExpert):
         return self.action_out_proj(self.expert.norm(hidden, condition)[0].float())
 
 
-class AdaptiveNorm(nn.Module):
+class _AdaptiveNorm(nn.Module):
     """RMS norm with scale and shift from a condition, which also gives a gate for the output of the next sublayer.
 
     All three are zero at first, so that a new layer changes nothing.
@@ -74,14 +74,14 @@ class AdaptiveNorm(nn.Module):
         return (normal * (1 + scale.float()) + shift.float()).to(tokens.dtype), gate.to(tokens.dtype)
 
 
-class AdaptiveLayer(nn.Module):
+class _AdaptiveLayer(nn.Module):
     """A layer of Gemma with adaptive norms."""
 
     def __init__(self, config: GemmaConfig, number: int) -> None:
         super().__init__()
         self.self_attn, self.mlp = GemmaAttention(config, number), GemmaMLP(config)
-        self.input_layernorm = AdaptiveNorm(config.hidden_size, config.rms_norm_eps)
-        self.post_attention_layernorm = AdaptiveNorm(config.hidden_size, config.rms_norm_eps)
+        self.input_layernorm = _AdaptiveNorm(config.hidden_size, config.rms_norm_eps)
+        self.post_attention_layernorm = _AdaptiveNorm(config.hidden_size, config.rms_norm_eps)
 
     def forward(
         self, hidden: Tensor, condition: Tensor, past: tuple[Tensor, Tensor] | None, **attention: Any

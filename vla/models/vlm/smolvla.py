@@ -84,11 +84,11 @@ class SmolVLA(FlowNetwork):
         self.unused_width = self.width
         shared = {**self.shared, "num_key_value_heads": key_heads, "rms_norm_eps": EPSILON, **NO_TOKENS}
         self.vlm = _trunk({**shared, **self.text}, self.vision, shuffle)
-        self.keypoints: KeypointTokens | None = None
+        self.keypoints: _KeypointTokens | None = None
         if keypoints:
             if image is None:
                 raise UserError(f"model.network.keypoints={keypoints} needs an image encoder in model.network.image")
-            self.keypoints = KeypointTokens(image, keypoints, self.width)
+            self.keypoints = _KeypointTokens(image, keypoints, self.width)
             nn.init.normal_(self.vlm.text_model.embed_tokens.weight, std=self.width**-0.5)  # scale of keypoint tokens
             del self.vlm.vision_model, self.vlm.connector
         self.expert = _expert(shared, joint_every, **self.expert_sizes)
@@ -157,7 +157,7 @@ class SmolVLA(FlowNetwork):
         return self.action_out_proj(self.expert.norm(hidden).float())
 
 
-class KeypointTokens(nn.Module):
+class _KeypointTokens(nn.Module):
     """Keypoints of an image as tokens, each with an embedding of its number.
 
     Args:
@@ -180,11 +180,11 @@ class KeypointTokens(nn.Module):
         return self.tokens(self.keypoints(features)) + self.number
 
 
-class TrunkLayer(KeyValueMixin, LlamaDecoderLayer):
+class _TrunkLayer(KeyValueMixin, LlamaDecoderLayer):
     """A layer of the trunk."""
 
 
-class ExpertLayer(LlamaDecoderLayer):
+class _ExpertLayer(LlamaDecoderLayer):
     """A layer of the expert."""
 
     def forward(self, hidden_states: Tensor | None, prefix: tuple[Tensor, Tensor], **attention: Any) -> Any:
@@ -195,7 +195,7 @@ class ExpertLayer(LlamaDecoderLayer):
         return super().forward(hidden_states, prefix=prefix, **attention)
 
 
-class ExpertAttention(LlamaAttention):
+class _ExpertAttention(LlamaAttention):
     """Attention of actions to the prefix and, if `joint`, to each other, by keys and values of their own."""
 
     def __init__(self, config: LlamaConfig, layer: int, *, joint: bool) -> None:
@@ -235,7 +235,7 @@ def _trunk(text: dict[str, Any], vision: dict[str, Any], shuffle: int) -> SmolVL
     """Build vision_model, connector and text_model."""
     config = SmolVLMConfig(text_config={"model_type": "llama", **text}, vision_config=vision, scale_factor=shuffle)
     trunk = SmolVLMModel(config)
-    shorten(trunk.text_model, TrunkLayer)
+    shorten(trunk.text_model, _TrunkLayer)
     return trunk
 
 
@@ -247,8 +247,8 @@ def _expert(shared: dict[str, Any], joint_every: int, hidden_size: int, intermed
     expert = LlamaModel(config)
     del expert.embed_tokens
     for number, layer in enumerate(expert.layers):
-        layer.self_attn = ExpertAttention(config, number, joint=number % joint_every == 0)
-        layer.__class__ = ExpertLayer
+        layer.self_attn = _ExpertAttention(config, number, joint=number % joint_every == 0)
+        layer.__class__ = _ExpertLayer
     return expert
 
 

@@ -37,7 +37,7 @@ PACKAGES = "libegl1, libgl1 and libgl1-mesa-dri"
 
 
 @dataclass(frozen=True)
-class DrawCall:
+class _DrawCall:
     """Triangles that one call draws."""
 
     texture: int  # id, or -1
@@ -182,7 +182,7 @@ class FastRenderer:
         self._buffers.update([shape.visible for shape in placed])
         ends = np.cumsum([0, *(shape.visible.triangles.size for shape in placed)]).tolist()
         self._calls = {
-            shape.element: DrawCall(self._texture_of(shape.element), start, shape.visible.triangles.size)
+            shape.element: _DrawCall(self._texture_of(shape.element), start, shape.visible.triangles.size)
             for shape, start in zip(placed, ends, strict=False)
         }
         order = list(self._calls)
@@ -192,7 +192,7 @@ class FastRenderer:
         radius |= dict.fromkeys(self._planes, np.inf)  # they may move along with a camera
         self._radii = MARGIN * np.array([radius[element] for element in self._opaque])
         # Elements rarely enter or leave a picture, so the merged calls are cached for every set of visible elements.
-        self._batches: dict[bytes, list[DrawCall]] = {}  # whether each opaque element is in sight → what to draw
+        self._batches: dict[bytes, list[_DrawCall]] = {}  # whether each opaque element is in sight → what to draw
         self._shadows.update([shape for shape in placed if shape.element != sky])
 
     def _texture_of(self, element: int) -> int:
@@ -202,7 +202,7 @@ class FastRenderer:
     def _kind(self, texture: int) -> shaders.Skin:
         return "none" if texture < 0 else "cube" if self._textures.is_cube(texture) else "2d"
 
-    def _draw(self, call: DrawCall) -> None:
+    def _draw(self, call: _DrawCall) -> None:
         if call.texture >= 0:
             self._textures.placed[call.texture].use(self._skin)
         self._scene[self._kind(call.texture)].render(moderngl.TRIANGLES, vertices=call.count, first=call.start)
@@ -340,13 +340,13 @@ class FastRenderer:
         context.clean()
 
 
-def _merge(calls: Collection[DrawCall]) -> list[DrawCall]:
+def _merge(calls: Collection[_DrawCall]) -> list[_DrawCall]:
     """Join calls with the same texture that follow each other with a small gap, if any."""
-    result: list[DrawCall] = []
+    result: list[_DrawCall] = []
     for call in calls:
         previous = result[-1] if result else None
         if previous and previous.texture == call.texture and call.start - previous.start - previous.count <= GAP:
             result.pop()
-            call = DrawCall(call.texture, previous.start, call.start + call.count - previous.start)
+            call = _DrawCall(call.texture, previous.start, call.start + call.count - previous.start)
         result.append(call)
     return result
