@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
+import toy
 from composing import composed
 from torch import Tensor
 
 from vla.config.experiment import Experiment
 from vla.io.errors import UserError
-from vla.jobs.benchmark import acting, run
+from vla.jobs.benchmark import acting, collect, loader, run
 from vla.jobs.benchmark.measure import machine, measure, other_load
 from vla.models.layers import Batch
 from vla.models.model import Model
 from vla.parallel.limits import cores
+from vla.spec import Array, Observation
 
 
 def test_an_evaluation_without_a_trained_policy_is_refused_before_other_stages(tmp_path: Path) -> None:
@@ -23,6 +26,48 @@ def test_an_evaluation_without_a_trained_policy_is_refused_before_other_stages(t
     with pytest.raises(UserError, match=r"plays a trained policy: add checkpoint=RUN"):
         run(Experiment.from_config(composed("job=benchmark", *asked)))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("names", ["[collect]", "[train,evaluate]"])
+def test_recordings_are_measured_where_nothing_is_played(recording: None, tmp_path: Path, names: str) -> None:
+    asked = ("task=recorded", "job=benchmark", f"benchmark.names={names}", f"output={tmp_path}/run")
+    with pytest.raises(UserError, match=r"which recordings cannot: set benchmark\.names=\[loader,train,policy\]"):
+        run(Experiment.from_config(composed(*asked)))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("options", "large"), [((), ["large"]), (("task=recorded",), []), (("expert=lerobot", "expert.folder=x"), [])]
+)
+def test_large_images_are_measured_where_an_expert_can_make_some(
+    recording: None, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], large: list[str]
+) -> None:
+    found = measure(3.0, "windows/s", 5, 2.0)
+    monkeypatch.setattr(loader, "demonstrations", lambda experiment: None)
+    learner = SimpleNamespace(model=SimpleNamespace(history=1, chunk=1))
+    monkeypatch.setattr(Experiment, "fitted_learner", lambda experiment, store: learner)
+    monkeypatch.setattr(loader, "_measure_loading", lambda *arguments: found)
+    monkeypatch.setattr(loader, "_measure_large_images", lambda *arguments: {"large": found})
+    measures = loader.loader(Experiment.from_config(composed("job=benchmark", *options)))
+    assert [*measures] == ["loader", "loader: 1 frame", "loader: 6 frames", *large]
+
+
+class Looking(toy.ToyExpert):
+    """An expert that cannot act without images."""
+
+    looks = True
+
+    def act(self, observation: Observation) -> Array:
+        assert observation.rgb
+        return super().act(observation)
+
+
+@pytest.mark.parametrize(
+    ("expert", "parts"), [(toy.ToyExpert, {"full", "blind", "replay"}), (Looking, {"full", "replay"})]
+)
+def test_an_expert_that_looks_at_the_images_is_not_timed_without(expert: type[toy.ToyExpert], parts: set[str]) -> None:
+    episodes, times = collect._time_parts(toy.make_environment(), expert(), 2)
+    assert len(episodes) == 2 and {*times} == parts
 
 
 def test_a_measure_stands_beside_its_floor_and_the_machine() -> None:

@@ -401,6 +401,13 @@ def test_a_checkpoint_is_not_evaluated_on_what_selected_it_whatever_is_validated
             jobs.run(Experiment.from_config(cfg))
 
 
+def test_a_checkpoint_is_measured_in_its_own_world_whatever_would_be_validated_in_the_default_one() -> None:
+    asked = ("job=benchmark", "task=metaworld", "validate=tabletop")
+    with pytest.raises(ValueError, match=r"^task \(validate\.changes\)\.randomize is unknown"):
+        check(composed(*asked))
+    check(composed(*asked, "checkpoint=RUN"))
+
+
 def test_a_checkpoint_may_be_evaluated_on_all_that_did_not_select_it(tmp_path: Path) -> None:
     for validate in ({"episodes": 20, "seed": 2_000_000}, {"episodes": 0, "seed": 1_000_000}, {}):
         path = save_policy(tmp_path / "theirs", {**SAVED, "validate": validate})

@@ -286,6 +286,7 @@ def test_arguments_of_ros_are_split_off() -> None:
         ([CHECKPOINT, "deploy=ros2", "--ros-args", "--nonsense"], "--nonsense"),
         ([CHECKPOINT, "deploy=loop", "deploy.agent.command=trajectory"], "obeys deploy.agent.command=joint_state only"),
         ([CHECKPOINT, "deploy=simulator", "deploy.joints_hz=25"], "joints_hz=25 must be a multiple of the task's 10"),
+        ([CHECKPOINT, "deploy=simulator", "deploy/robot=ur5e"], "the task has 7 joints, the robot 6"),
         ([CHECKPOINT, "deploy=simulator", "~deploy.topics.images.wrist"], "no topic for the task's cameras wrist"),
         ([CHECKPOINT, "deploy=ros2", "~deploy.topics.images.wrist"], "wrist"),
     ],

@@ -129,6 +129,11 @@ def test_without_the_simulators_truth_the_expert_says_so(tabletop: Tabletop) -> 
         Waypoint(tabletop.spec).act(observation)
 
 
+def test_the_expert_of_the_tabletop_refuses_another_world_that_has_a_gripper() -> None:
+    with pytest.raises(ValueError, match="acts in task=tabletop only"):
+        Waypoint(toy.ARM_SPEC)
+
+
 TOY: Any = {
     **{**QUIET, "tool": "point", "move": ("x", "y"), "turn": None, "gripper": "gripper"},
     **{"start": 1.0, "start_steps": (3, 3), "steps": (2, 5), "closed": 0.5, "pace": (1.0, 1.0)},

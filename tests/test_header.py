@@ -127,5 +127,7 @@ def test_a_spec_comes_back_as_it_was() -> None:
     ):
         with pytest.raises(ValueError, match=rf"^the spec is not valid: {says}"):
             Spec.from_dict(replace(ARM_SPEC, parts=(part,)).to_dict())
+    with pytest.raises(ValueError, match=r"is not valid: cameras names state, text, as another input of policies is"):
+        Spec.from_dict(replace(ARM_SPEC, cameras=("state", "text"), depth=()).to_dict())
     with pytest.raises(ValueError, match=r"^x\.ckpt is damaged or of another kind: .*set"):
         Spec.from_dict({**ARM_SPEC.to_dict(), "cameras": {1}}, "x.ckpt")

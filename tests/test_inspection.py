@@ -317,3 +317,10 @@ def test_the_job_merges_and_refuses_what_contradicts_itself(tmp_path: Path) -> N
     with pytest.raises(ValueError, match="does not contain the task of seed 0"):
         arguments = (f"inspect.folder={store.folder}", "inspect.episode=0", f"output={tmp_path}")
         run(Experiment.from_config(composed("job=inspect", *arguments)))
+
+
+def test_an_imported_episode_is_not_replayed(tmp_path: Path) -> None:
+    store = add(tmp_path / "store", [replace(EPISODES[0], draws={"recorded": {"episode": 0}})])
+    arguments = (f"inspect.folder={store.folder}", "inspect.episode=0", f"output={tmp_path}")
+    with pytest.raises(UserError, match=r"seed 0 in .*store was imported from a recording, so there is no world"):
+        run(Experiment.from_config(composed("job=inspect", *arguments)))

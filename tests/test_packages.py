@@ -166,6 +166,11 @@ def test_each_stage_is_a_job_of_its_own(home: Path, importable: None) -> None:
     assert staged["per_episode"] == whole["per_episode"]
 
 
+def test_its_recorder_keeps_what_a_preview_shows(home: Path, importable: None) -> None:
+    here(home, "job=preview", "experiment=mine", "recorder=mine", "preview.episodes=2", "output=look")
+    assert sorted(path.name for path in (home / "look/recordings").iterdir()) == ["0.jsonl", "1.jsonl"]
+
+
 def test_its_demonstrations_are_described_replayed_and_exported(home: Path, importable: None) -> None:
     shutil.copytree(home / "episodes", home / "copy")  # whose card is none of the others' business
     replay = ("job=inspect", "inspect.folder=copy", "inspect.episode=0", "output=replay")

@@ -200,6 +200,7 @@ def test_outliers_do_not_widen_the_bounds_and_rare_events_do() -> None:
         (["task.units={elbow: rad}"], "error: task.units names elbow, the components are joint1.pos"),
         (["agent=remote", "agent.images.top=top"], "; +agent.images.top=VALUE adds it"),
         (["validate.episodes=3"], "validate.episodes=3: nothing can be played in a recording"),
+        (["job=evaluate", "evaluate.against=nowhere"], "need a success rate, which recordings lack: omit them"),
         (["job=preview"], "the task has no simulator, only recordings, so nothing can be played in it"),
     ],
 )

@@ -152,6 +152,7 @@ def test_it_logs_how_fast_it_is_and_what_it_waits_for(folder: Path, tmp_path: Pa
         (("trainer.max_steps=-1",), ["learner.schedule=cosine has no end"]),
         (("trainer.max_steps=-1", "learner.schedule=constant"), []),
         (("~learner.warmup_steps",), []),  # as of a learner that has none
+        (("trainer.max_steps=-1", "~learner.schedule"), []),
     ],
 )
 def test_what_never_happens_in_a_training_is_said(

@@ -25,6 +25,8 @@ IN_DISTRIBUTION = "seen"  # name of the unchanged condition of an evaluation, wh
 FIRST_SEED = 1_000_000  # smallest seed of evaluations; collection uses smaller seeds only
 LONGEST_INSTRUCTION = 1000  # characters
 MAX_SAMPLE = 2**18  # largest number of actions in a sample
+# Beside the images in a batch, or in an observation of gymnasium.
+INPUTS = ("state", "instruction", "text", "present", "tokens", "noise", "running", "remaining", "delay")
 
 
 # Limits of a spec that is read from a file.
@@ -197,6 +199,8 @@ def _contradictions(spec: Spec) -> Iterator[str]:
     for name, low, high in zip(spec.action, spec.low, spec.high, strict=False):
         if not low < high:
             yield f"low of {name} is {low}, not less than high, {high}"
+    if inputs := [camera for camera in spec.cameras if camera in INPUTS]:
+        yield f"cameras names {', '.join(inputs)}, as another input of policies is called"
     if unknown_names := [camera for camera in spec.depth if camera not in spec.cameras]:
         yield f"depth names {', '.join(unknown_names)}, which is not among the cameras"
     if not unique(spec.cut):

@@ -134,7 +134,7 @@ def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None
     conditions = {}
     if settings.job in ("evaluate", "improve"):
         conditions = {f"evaluate.conditions.{name}": changes for name, changes in evaluate.changes.items()}
-    if "learner" in groups and validate.episodes:
+    if "learner" in groups and validate.episodes and settings.checkpoint is None:  # a checkpoint is not trained
         conditions["validate.changes"] = validate.changes
     if "improve" in groups:
         conditions["improve.changes"] = experiment.options(Rounds).changes

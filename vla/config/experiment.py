@@ -138,6 +138,11 @@ class Experiment:
         """True if agents can act in the world of the task; else it is known from recordings only."""
         return not issubclass(self.kind("task"), SpecOnly)
 
+    @property
+    def has_expert(self) -> bool:
+        """True if the expert acts in the world of the task; else there are recorded demonstrations."""
+        return self.playable and hasattr(self.kind("expert"), "act")
+
     def world(self) -> Environment | SpecOnly:
         """Build the world of the task and close it: only its description is used, such as spec and tasks."""
         if not self.playable:

@@ -13,7 +13,7 @@ from annotated_types import Gt, Le, MinLen
 
 from vla.io.errors import UserError
 from vla.io.types import NonNegative, Positive, Text
-from vla.spec import Array
+from vla.spec import Array, RobotModel
 
 PositiveShare = Annotated[float, Gt(0), Le(1)]
 
@@ -56,6 +56,21 @@ class JointLimits:
             )
         if not (self.min_position < self.max_position).all():
             raise UserError("deploy.robot.low must be below high by more than twice the margin, for every joint")
+
+    def require(self, model: RobotModel, owner: str) -> None:
+        """Raise a UserError unless an arm of these limits can be that of `owner`, a policy or a task."""
+        if len(self.joints) != len(model.joints):
+            raise UserError(
+                f"{owner} has {len(model.joints)} joints, the robot {len(self.joints)}: use another deploy/robot"
+            )
+        for name, robot_name in zip(model.joints, self.joints, strict=True):
+            if name != robot_name and name in self.joints:
+                raise UserError(
+                    f"{owner} has {name} where deploy.robot.joints has {robot_name}: list joints and limits of the "
+                    f"robot in {owner}'s order, {', '.join(model.joints)}"
+                )
+        if model.gripper and not self.fingers:
+            raise UserError(f"{owner} sees how far its gripper is open: name the joints in deploy.robot.fingers")
 
     @property
     def min_position(self) -> Array:

@@ -76,19 +76,7 @@ class Goals:
         Raises:
             UserError: the arm cannot execute such actions, or cannot be kept in the box.
         """
-        model = spec.require_robot("deployment")
-        if len(limits.joints) != len(model.joints):
-            raise UserError(
-                f"the policy has {len(model.joints)} joints, the robot {len(limits.joints)}: use another deploy/robot"
-            )
-        for name, robot_name in zip(model.joints, limits.joints, strict=True):
-            if name != robot_name and name in limits.joints:
-                raise UserError(
-                    f"the policy has {name} where deploy.robot.joints has {robot_name}: list joints and limits of the "
-                    f"robot in the policy's order, {', '.join(model.joints)}"
-                )
-        if model.gripper in spec.state and not limits.fingers:
-            raise UserError("the policy sees how far its gripper is open: name the joints in deploy.robot.fingers")
+        limits.require(spec.require_robot("deployment"), "the policy")
         self._spec, self._gripper = spec, gripper_index(spec)
         self.has_gripper = self._gripper is not None
         reach = limits.min_position, limits.max_position, np.array(limits.speed)

@@ -33,8 +33,9 @@ class SimulatorNode(Node):
         """Args: an environment that `TakesJointTargets`; the settings.
 
         Raises:
-            UserError: the environment has no robot, is not `TakesJointTargets`, or gives several instructions in a
-                row, a control step is not a whole number of ticks, or a camera has no topic.
+            UserError: the environment has no robot, or another one than the settings, is not `TakesJointTargets`, or
+                gives several instructions in a row, a control step is not a whole number of ticks, or a camera has no
+                topic.
         """
         rates, topics, limits = (settings.joints_hz, settings.camera_hz), settings.topics, settings.robot
         self._model = environment.spec.require_robot("deploy=simulator")
@@ -42,6 +43,7 @@ class SimulatorNode(Node):
             raise UserError(
                 f"deploy=simulator needs TakesJointTargets, such as task=tabletop: {type(environment).__name__} is none"
             )
+        limits.require(self._model, "the task")
         control_hz = environment.spec.control_hz
         self._ticks_per_step = round(rates[0] / control_hz)
         if not math.isclose(self._ticks_per_step * control_hz, rates[0]):

@@ -261,6 +261,12 @@ def _require_distinct(condition: str, world: Any, options: Evaluation) -> None:
 def _statements(experiment: Experiment) -> list[Statement]:
     """Build the statements to decide; raise a UserError if the run to compare with is missing, or nothing to decide."""
     options, statements = experiment.evaluate, list[Statement]()
+    measured = (options.bar is not None, options.against, options.until, options.agent_conditions)
+    if not experiment.playable and any(measured):
+        raise UserError(
+            "evaluate.bar, against, until, without, nearest and networks need a success rate, which recordings lack: "
+            "omit them"
+        )
     if options.bar is not None:
         statements.append(BarStatement(options.bar))
     if options.against is not None:
@@ -269,11 +275,6 @@ def _statements(experiment: Experiment) -> list[Statement]:
         raise UserError(
             "evaluate.until=decided needs something to decide: evaluate.bar=0.95, evaluate.against=RUN, or conditions, "
             "as in evaluate=suite"
-        )
-    if not experiment.playable and (statements or options.until or options.agent_conditions):
-        raise UserError(
-            "evaluate.bar, against, until, without, nearest and networks need a success rate, which recordings lack: "
-            "omit them"
         )
     return statements
 

@@ -73,11 +73,13 @@ def _replay_episode(experiment: Experiment, folder: Path, seed: int) -> None:
     """Replay the actions of a stored episode and compare the states.
 
     With a recorder, write `episode-SEED.rrd`: the episode in the 3-D scene of the replay. A robot in the experiment
-    replaces that of the store's task, which may not name files. Raises a UserError if there is no such episode, its
-    store lacks the task, or the task now has another spec.
+    replaces that of the store's task, which may not name files. Raises a UserError if there is no such episode, it was
+    imported, its store lacks the task, or the task now has another spec.
     """
     store, output, robot = EpisodeStore(folder, allow_damage=True), experiment.output, experiment["task"].get("robot")
     config, episode = find_episode(store, seed)
+    if "recorded" in episode.draws:
+        raise UserError(f"seed {seed} in {folder} was imported from a recording, so there is no world to replay it in")
     if not isinstance(config.get("task"), dict):
         raise UserError(f"{folder} does not contain the task of seed {seed}, so there is no scene to replay it in")
     if robot:

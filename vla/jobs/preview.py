@@ -13,7 +13,9 @@ from vla.io.files import writing
 from vla.io.printable import show
 from vla.reports.observations import draws_table, reset_panels
 from vla.reports.pictures import save
+from vla.rollouts.recordings import SUFFIXES
 from vla.rollouts.rollout import close_agent, rollout
+from vla.runs.folder import RECORDINGS
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +42,10 @@ def run(experiment: Experiment) -> None:
 
             merge(recordings, output / "preview.rrd")
             files.append(output / "preview.rrd")
+        for file in sorted(Path(folder).iterdir()):
+            if file.suffix not in SUFFIXES:  # of a recorder of a package
+                (output / RECORDINGS).mkdir(exist_ok=True)
+                files.append(file.replace(output / RECORDINGS / file.name))
     save(output / "preview.png", reset_panels(list(seeds), first_observations), 2, (6.5, 2.2))
     show(draws_table(list(seeds), draws))
     log.info("wrote %s", " and ".join(map(str, files)))

@@ -104,11 +104,11 @@ def warn_of_length(experiment: Experiment) -> None:
     learner, trainer = experiment["learner"], experiment["trainer"]
     steps, interval = trainer["max_steps"], trainer["val_check_interval"]
     if steps in (None, -1):
-        if learner["schedule"] == "cosine":
+        if learner.get("schedule") == "cosine":  # a learner of a package may have no such key
             text = "without trainer.max_steps, learner.schedule=cosine has no end: the learning rate stays at its peak"
             log.warning(text)
         return
-    if steps <= (warmup := learner.get("warmup_steps", 0)):  # a learner of a package may have no such key
+    if steps <= (warmup := learner.get("warmup_steps", 0)):
         text = "trainer.max_steps=%d ends within learner.warmup_steps=%d: the learning rate does not reach its peak"
         log.warning(text, steps, warmup)
     if interval > (batches := steps * trainer["accumulate_grad_batches"]):
@@ -127,7 +127,8 @@ def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_s
     store, model = demonstrations(experiment), learner.model
     if origin is last is None:
         experiment.fit_tokenizer(model.tokenizer, store)
-        if parts := [part for part in experiment["learner"]["frozen"] if not is_within(part, trunks(model))]:
+        frozen = experiment["learner"].get("frozen", ())
+        if parts := [part for part in frozen if not is_within(part, trunks(model))]:
             log.warning("learner.frozen=[%s]: what is not pretrained there stays random", ", ".join(parts))
     if last is None:
         model.fit(store.numbers("state"), store.numbers("action"))

@@ -28,10 +28,16 @@ def run(experiment: Experiment) -> dict[str, Measure]:
     """Measure the stages in `benchmark.names`, print a table and write `benchmark.json`; returns name → measure.
 
     Both name the processor, and how many of its cores other programs used during a stage. Raises a UserError if there
-    is no policy to evaluate.
+    is no policy to evaluate, or nothing can be played.
     """
     host, measures, names = machine(), dict[str, Measure](), experiment.options(Benchmark).names
-    if "evaluate" in names and experiment.checkpoint is None:  # before the others, which take minutes
+    # Before any stage, because they take minutes.
+    if ("evaluate" in names and not experiment.playable) or ("collect" in names and not experiment.has_expert):
+        raise UserError(
+            "benchmark.names: collect and evaluate play episodes, which recordings cannot: set "
+            "benchmark.names=[loader,train,policy]"
+        )
+    if "evaluate" in names and experiment.checkpoint is None:
         raise UserError("benchmark.names=[evaluate] plays a trained policy: add checkpoint=RUN")
     for name in names:
         stage, (start_load, start) = getattr(import_module(f"{__name__}.{MODULES.get(name, name)}"), name), other_load()

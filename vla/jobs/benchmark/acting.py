@@ -14,6 +14,7 @@ from vla.config.build import Group, build
 from vla.config.compose import compose
 from vla.config.experiment import Experiment, to_plain
 from vla.config.nodes import Benchmark
+from vla.data.verification import episode_of
 from vla.io.errors import UserError
 from vla.jobs.benchmark.measure import Measure, measure, timed
 from vla.jobs.collect import demonstrations
@@ -30,11 +31,10 @@ def policy(experiment: Experiment) -> dict[str, Measure]:
     Raises:
         UserError: the peer plans other actions.
     """
-    environment = experiment.make_environment()()
-    observation = environment.reset(0)
-    environment.close()
-    model = experiment.fitted_learner(demonstrations(experiment)).model
-    agent = experiment.build("policy", model=model, spec=environment.spec)
+    store = demonstrations(experiment)
+    observation = episode_of(store, store.episodes[0]).observations[0]
+    model = experiment.fitted_learner(store).model
+    agent = experiment.build("policy", model=model, spec=store.spec)
     for _ in range(model.history + 1):  # warm-up: compiles and allocates
         agent.act(observation)
     frame = agent.frame(observation)

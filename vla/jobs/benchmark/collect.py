@@ -42,12 +42,13 @@ def collect(experiment: Experiment) -> dict[str, Measure]:
         with store.writing():
             times["storing"] = timed(partial(_keep, store, episodes))[1]
     environment.close()
-    full, blind = times.pop("full"), times.pop("blind")
+    full, blind = times.pop("full"), times.pop("blind", None)
     physics, rendering = times.get("physics", 0.0), times.get("rendering", 0.0)
     floor = steps / (physics + rendering) if physics else None
     measures = {"collect": measure(steps / full, unit, steps, floor)}
     whole = 1000 * (full + times["replay"] + times["storing"]) / steps
-    times |= {"expert, controller, judge": blind - physics, "images into arrays": full - blind - rendering}
+    if blind is not None:
+        times |= {"expert, controller, judge": blind - physics, "images into arrays": full - blind - rendering}
     for name, seconds in times.items():
         measures[f"collect: {name}"] = measure(1000 * seconds / steps, "ms/step", steps, whole)
     if "rendering" in times:
@@ -61,10 +62,12 @@ def collect(experiment: Experiment) -> dict[str, Measure]:
 def _time_parts(environment: Environment, expert: Agent, count: int) -> tuple[list[Episode], dict[str, float]]:
     """Return episodes, and the time [s] of "full" rollouts, "blind" ones, "replay", and each call of `minimal_step`.
 
+    There are no blind rollouts of an expert that looks at the images.
     The parts are timed in turns, episode by episode, so that other load on the machine slows all of them alike.
     """
     calls = getattr(environment, "minimal_step", dict)()
-    episodes, times = list[Episode](), dict.fromkeys((*calls, "full", "blind", "replay"), 0.0)
+    kinds = ("full", "replay") if getattr(expert, "looks", True) else ("full", "blind", "replay")
+    episodes, times = list[Episode](), dict.fromkeys((*calls, *kinds), 0.0)
     for seed in range(count):
         episode, seconds = timed(partial(rollout, environment, expert, seed))
         episodes.append(episode)
@@ -75,7 +78,8 @@ def _time_parts(environment: Environment, expert: Agent, count: int) -> tuple[li
                 for name, call in calls.items():
                     times[name] += timed(call)[1]
                 environment.step(action)
-            times["blind"] += timed(partial(rollout, environment, expert, seed))[1]
+            if "blind" in times:
+                times["blind"] += timed(partial(rollout, environment, expert, seed))[1]
             times["replay"] += timed(partial(replay, environment, episode))[1]
     return episodes, times
 

@@ -26,15 +26,15 @@ EPISODES, STEPS = 2500, 100  # of a store whose size is extrapolated
 def loader(experiment: Experiment) -> dict[str, Measure]:
     """Measure windows per second with the history of the model and others; the floor is a bare gather of the images.
 
-    If the task has an option for the image size, also measure large images from three cameras in two codecs, and the
-    size of their store; the floor of that size is the size of the raw images.
+    If an expert can act in the task, and that has an option for the image size, also measure large images from three
+    cameras in two codecs, and the size of their store; the floor of that size is the size of the raw images.
     """
     store = demonstrations(experiment)
     model = experiment.fitted_learner(store).model
     variant = experiment.with_values({"collect.more": None})  # the floor reads one store
     names = {"loader": model.history, "loader: 1 frame": 1, "loader: 6 frames": 6}
     measures = {name: _measure_loading(variant, store, frames, model.chunk) for name, frames in names.items()}
-    if "image_size" in experiment["task"]:
+    if experiment.has_expert and isinstance(experiment["task"].get("image_size"), list):
         measures |= _measure_large_images(variant.with_values({"task.image_size": [LARGE, LARGE]}), model.chunk)
     return measures
 

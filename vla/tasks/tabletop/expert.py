@@ -41,9 +41,9 @@ class Waypoint:
     memoryless = True
 
     def __init__(self, spec: Spec) -> None:
-        """Act in an environment of this spec; a UserError if it has no robot with a gripper."""
+        """Act in an environment of this spec; a UserError if it is not that of the tabletop."""
         self._low, self._high = np.array(spec.low), np.array(spec.high)
-        if spec.robot is None or spec.robot.gripper is None:
+        if spec.robot is None or spec.robot.gripper is None or "faces" not in dict(spec.truth):
             raise UserError("the expert of the tabletop acts in task=tabletop only: choose the expert of this task")
         self._gripper = spec.state.index(spec.robot.gripper)
         self.info: dict[str, Any] = {}
