@@ -89,6 +89,18 @@ def written(folder: Path) -> int:
     return sum(len(files) for place in places for _, _, files in os.walk(place))
 
 
+@pytest.mark.parametrize("field", ["rgb_front", "rgb_wrist", "depth_wrist", "truth"])
+def test_a_damaged_store_becomes_no_dataset_whether_or_not_the_damage_would_be_in_it(
+    field: str, tmp_path: Path
+) -> None:
+    store, _ = stored(tmp_path / "store")
+    rows = bytearray((path := store.folder / f"{field}.bin").read_bytes())
+    rows[0] ^= 1
+    path.write_bytes(rows)
+    with pytest.raises(ValueError, match=r"rows of seed 0 in .* were changed on disk"):
+        exporter("lerobot", tmp_path / "dataset").export(store)
+
+
 def test_a_resumed_export_keeps_the_videos_that_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store, _ = stored(tmp_path / "store")
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):

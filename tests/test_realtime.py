@@ -133,6 +133,10 @@ def test_an_evaluation_without_latency_is_that_of_the_policy_and_with_latency_re
     expected = rollout(toy.make_environment(), as_policy(model), FIRST_SEED).executed
     np.testing.assert_array_equal(executed(network_of(0.0)), expected)
     late = executed(network_of(0.2, 0.1, 0.1))
+    agent = NetworkedAgent(as_policy(model), network_of(0.2, 0.1, 0.1), toy.SPEC)
+    partly = rollout(toy.make_environment(), agent, FIRST_SEED, all_images=False)
+    np.testing.assert_array_equal(partly.executed, late)
+    assert 0 < sum(bool(seen.rgb) for seen in partly.observations) < len(partly.observations)
     np.testing.assert_array_equal(late, executed(network_of(0.2, 0.1, 0.1)))
     assert not np.array_equal(late, expected)
 

@@ -46,6 +46,7 @@ from vla.models.model import Model
 from vla.policy import Policy
 from vla.rollouts.evaluate import play_episode
 from vla.rollouts.remote import Component, RemotePolicy
+from vla.rollouts.rollout import rollout
 from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Array, Observation, RunningPlan
 
 TEXTS = ("go", "lift it now", "go", "put it down")
@@ -405,6 +406,13 @@ def test_it_serves_until_it_is_told_to_stop(number: signal.Signals, caplog: pyte
         settings(as_policy(make_bc())).run()
         thread.join(60)
     assert asked == [b"OK\n"]
+
+
+def test_a_client_needs_no_images_of_steps_at_which_it_sends_nothing() -> None:
+    with acting(as_policy(make_act(chunk=4, execute=2))) as agent:
+        every, some = (rollout(ToyEnvironment(), agent, FIRST_SEED, all_images=complete) for complete in (True, False))
+    assert np.array_equal(every.executed, some.executed)
+    assert [step for step, seen in enumerate(some.observations) if seen.rgb] == [*range(0, len(some.observations), 2)]
 
 
 def test_somebody_elses_actions_become_ours() -> None:

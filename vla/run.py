@@ -151,9 +151,10 @@ def _run_job(cfg: DictConfig) -> float | None:
     composed: Any = OmegaConf.to_container(cfg, resolve=False)
     # Before anything is read from a file.
     trust(composed.get("trust"), [composed["job"], *targets(composed)], packages(composed))
-    default = compose("config", [f"job={HydraConfig.get().runtime.choices['job']}"])
     cfg = _merge_saved(cfg, overrides)
-    experiment, job = Experiment.from_config(cfg, default), jobs.find(cfg.job)
+    job, option = jobs.find(cfg.job), HydraConfig.get().runtime.choices["job"]
+    default = compose("config", [f"job={option}"]) if job.saves_config else None
+    experiment = Experiment.from_config(cfg, default)
     check(experiment, job)
     _require_sweepable(experiment, job.needs(experiment.nodes))
     if jobs.builds_world(experiment) and (replacements := substitutes(experiment["task"], overrides)):

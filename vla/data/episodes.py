@@ -17,7 +17,7 @@ import json
 import logging
 import os
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -185,8 +185,8 @@ class EpisodeStore:
         starts, ends = (self.fields[field].sizes(rows) for rows in (entry.start, entry.end))
         return sum(ends) - sum(starts)
 
-    def read(self, entry: Entry) -> dict[str, Array]:
-        """Read one episode as field → (steps, …) rows; a DamageError if a checksum differs.
+    def read(self, entry: Entry, fields: Collection[str] | None = None) -> dict[str, Array]:
+        """Read one episode as field → (steps, …) rows, by default of all `fields`; a DamageError if a checksum differs.
 
         A UserError if it is larger than the memory: a few compressed bytes can promise any image.
         """
@@ -196,7 +196,7 @@ class EpisodeStore:
                 f"seed {entry.seed} in {self.folder} unpacks to {size / 1e9:.0f} GB, and this machine has "
                 f"{limit / 1e9:.0f} GB of memory: leave it out, or read it on a larger machine"
             )
-        sources = {field: self.rows(field) for field in self.fields}
+        sources = {field: self.rows(field) for field in fields or self.fields}
         rows = {field: np.array(source[entry.span]) for field, source in sources.items()}
         for field, values in rows.items():
             if len(values) < entry.steps or _checksum(sources[field], entry.span, values) != entry.crc.get(field):

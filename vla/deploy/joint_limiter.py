@@ -6,6 +6,7 @@ Shapes: J joints. Positions [rad], speeds [rad/s], accelerations [rad/s²].
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -72,22 +73,22 @@ class JointLimits:
         if model.gripper and not self.fingers:
             raise UserError(f"{owner} sees how far its gripper is open: name the joints in deploy.robot.fingers")
 
-    @property
+    @cached_property
     def min_position(self) -> Array:
         """(J,) smallest allowed positions [rad]."""
         return np.array(self.low) + self.margin
 
-    @property
+    @cached_property
     def max_position(self) -> Array:
         """(J,) largest allowed positions [rad]."""
         return np.array(self.high) - self.margin
 
-    @property
+    @cached_property
     def max_speed(self) -> Array:
         """(J,) largest allowed speeds [rad/s]."""
         return np.array(self.speed) * self.speed_share
 
-    @property
+    @cached_property
     def max_acceleration(self) -> Array:
         """(J,) largest allowed accelerations [rad/s²]."""
         return np.array(self.acceleration) * self.acceleration_share

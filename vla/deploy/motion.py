@@ -53,8 +53,7 @@ class _Workspace:
         trial = copy.copy(limiter)
         trial.step(goal, remaining)
         position, velocity = trial.position, trial.velocity
-        farthest = max(LEEWAY, self._outside(limiter.position))
-        while self._outside(trial.position) <= farthest:
+        while (distance := self._outside(trial.position)) <= LEEWAY or distance <= self._outside(limiter.position):
             if trial.resting:
                 limiter.position, limiter.velocity = position, velocity
                 return

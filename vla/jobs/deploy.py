@@ -11,8 +11,6 @@ from vla.config.experiment import Experiment
 from vla.io.errors import UserError
 from vla.io.printable import escape
 from vla.models.policy_folder import require_unseen
-from vla.reports.evaluation import plot_report, write_report
-from vla.reports.run_page import write_page
 from vla.runs.folder import PLOT, REPORT, describe_files
 from vla.spec import FIRST_SEED
 
@@ -36,6 +34,9 @@ def run(experiment: Experiment) -> None:
     if getattr(deployment, "needs_policy", True) and experiment.checkpoint is experiment.make_agent() is None:
         raise UserError("this deployment needs a trained policy: add checkpoint=RUN")
     if (report := deployment.run()) is not None:
+        from vla.reports.evaluation import plot_report, write_report  # imports matplotlib, as the next one does
+        from vla.reports.run_page import write_page
+
         output = experiment.output
         write_report(report, output / REPORT, experiment.settings.checkpoint, experiment.config)
         plot_report(report, output / PLOT)

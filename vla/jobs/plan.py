@@ -9,7 +9,6 @@ from vla.config.experiment import Experiment
 from vla.config.nodes import Power
 from vla.io.errors import UserError
 from vla.io.printable import show
-from vla.reports.comparison import common_episodes, read_runs
 from vla.reports.tables import Table
 from vla.rollouts.planning import (
     MAX_EPISODES,
@@ -75,6 +74,8 @@ def _shares(asked: Power, one: float, other: float) -> dict[str, float]:
 
 def _measured_share(folders: tuple[str, str]) -> float:
     """Return the share of the common episodes of two runs in which only one succeeded."""
+    from vla.reports.comparison import common_episodes, read_runs  # imports matplotlib
+
     one, other = read_runs([Path(folder) for folder in folders]).values()
     if pairs := common_episodes(one, other, IN_DISTRIBUTION):
         return sum(first.success != second.success for first, second in pairs) / len(pairs)

@@ -12,6 +12,7 @@ from vla.data.episodes import EpisodeStore
 from vla.io.images import resize
 from vla.io.types import Count
 from vla.rollouts.rollout import AgentFactory, close_agent
+from vla.rollouts.worlds import as_agents
 from vla.spec import Agent, Array, Environment, Observation, Spec
 
 Modality = Literal["images", "instruction", "both"]
@@ -23,10 +24,17 @@ STRIDE = 4  # of the pixels that are compared
 class AgentWithoutModality:
     """An agent whose images are grey and without depth, or whose instruction is empty, or both."""
 
-    def __init__(self, agent: Agent, modality: Modality) -> None:
-        """Hide a modality from an agent."""
+    def __init__(self, agent: Agent, modality: Modality, spec: Spec) -> None:
+        """Hide a modality from an agent, in an environment with a spec."""
         self._agent, self._missing = agent, modality
+        self._rgb = {camera: np.full((*spec.image_size, 3), GREY, np.uint8) for camera in spec.cameras}
+        self._depth = {camera: np.zeros(spec.image_size, np.uint16) for camera in spec.depth}
         self.info: dict[str, Any] = {}
+
+    @property
+    def looks(self) -> bool:
+        """Whether the next action may depend on the images: never if they are hidden."""
+        return self._missing == "instruction" and as_agents(self._agent).looking(0)
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode."""
@@ -37,9 +45,7 @@ class AgentWithoutModality:
         if self._missing != "images":
             observation = replace(observation, instruction="")
         if self._missing != "instruction":
-            rgb = {camera: np.full_like(image, GREY) for camera, image in observation.rgb.items()}
-            depth = {camera: np.zeros_like(image) for camera, image in observation.depth.items()}
-            observation = replace(observation, rgb=rgb, depth=depth)
+            observation = replace(observation, rgb=self._rgb, depth=self._depth)
         action = self._agent.act(observation)
         self.info = self._agent.info
         return action
@@ -51,7 +57,7 @@ class AgentWithoutModality:
 
 def make_agent_without(make_agent: AgentFactory, modality: Modality, environment: Environment) -> AgentWithoutModality:
     """Build an agent without a modality for an environment."""
-    return AgentWithoutModality(make_agent(environment), modality)
+    return AgentWithoutModality(make_agent(environment), modality, environment.spec)
 
 
 class NearestDemonstration:

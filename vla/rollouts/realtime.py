@@ -79,8 +79,7 @@ class RealTime:
         first = self._last_action is None
         self._link.tick()
         self._take()
-        execute = 1 if first or self._ensemble is not None else self._execute()
-        if self._answer is None and self._schedule.wants_plan(self._step, execute):
+        if self._answer is None and self._wants_plan():
             self._answer, self._sent_step = self._link.send(self._with_plan(observation), first), self._step
             self._take(wait=first)
         if actions := self._schedule.actions_at(self._step):
@@ -89,6 +88,15 @@ class RealTime:
             return self._last_action
         assert self._last_action is not None, "the first answer has actions"
         return np.where(self._relative, 0, self._last_action).astype(np.float32)
+
+    @property
+    def looks(self) -> bool:
+        """Whether the next observation may be sent; what is not sent is not read."""
+        return self._answer is not None or self._wants_plan()
+
+    def _wants_plan(self) -> bool:
+        execute = 1 if self._last_action is None or self._ensemble is not None else self._execute()
+        return self._schedule.wants_plan(self._step, execute)
 
     def _with_plan(self, observation: Observation) -> Observation:
         """Return the observation with the rest of the plan that is executed until the next one arrives."""
@@ -216,6 +224,11 @@ class NetworkedAgent:
     def _execute(self) -> int:
         """Return how many actions to execute before the next observation is sent; a history needs every observation."""
         return 1 if getattr(self._agent, "history", 1) > 1 else getattr(self._agent, "execute", None) or 1
+
+    @property
+    def looks(self) -> bool:
+        """Whether the next observation may be sent."""
+        return self._real_time.looks
 
     def act(self, observation: Observation) -> Array:
         """Return the action (D,) to execute now."""

@@ -144,6 +144,11 @@ class RemotePolicy:
         if self.metadata.get("reset") is True:
             self._ask({"reset": True, "prompt": instruction, "seed": seed})
 
+    @property
+    def looks(self) -> bool:
+        """Whether the next observation may be sent."""
+        return self._real_time.looks
+
     def act(self, observation: Observation) -> Array:
         """Return the next action, (D,) float32, clipped to the spec; `info` has the time of the last answer.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import pickle
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,39 +18,17 @@ from vla.models.policy_folder import BEST
 from vla.parallel.limits import free_memory
 from vla.parallel.pool import Future, ProcessPool, WorkerCrash
 from vla.parallel.processes import one_thread_each
-from vla.rollouts.evaluate import play_episodes
 from vla.rollouts.results import ERROR, Result
 from vla.rollouts.statistics import wilson_interval
 from vla.spec import Agent, Environment
 from vla.training.device import memory_of
+from vla.training.player import Player
 
 log = logging.getLogger(__name__)
 
 ROOM = 3  # memory of a process with a model, as a multiple of its weights: they arrive pickled, and the model acts
 GPU_PROCESS_MEMORY = 1e9  # of the GPU, and of the machine, that a process takes without its model [bytes]
 PER_WORKER = 5  # smallest number of episodes per process; fewer would take less time than its start
-
-
-class _Player:
-    """Worker that plays episodes with a copy of a model, and keeps environments only while it plays."""
-
-    def __init__(self, make_environment: Callable[[], Environment], make_policy: Callable[[Model], Agent]) -> None:
-        self._make_environment, self._make_policy = make_environment, make_policy
-
-    def attempt(self, item: tuple[bytes, Sequence[int]]) -> list[Result]:
-        """Play the episodes of seeds with a pickled model."""
-        return self.play(pickle.loads(item[0]), item[1])
-
-    def play(self, model: Model, seeds: Sequence[int]) -> list[Result]:
-        """Play the episodes of seeds with a model, in as many worlds side by side as its policy has lanes."""
-        policy = self._make_policy(model)
-        lanes = min(getattr(policy, "lanes", 1), len(seeds))
-        with ExitStack() as stack:
-            environments = [stack.enter_context(closing(self._make_environment())) for _ in range(lanes)]
-            return play_episodes(environments, policy, seeds)
-
-    def close(self) -> None:
-        """Do nothing: there are no resources to free."""
 
 
 class ClosedLoop(Callback):
@@ -78,7 +55,7 @@ class ClosedLoop(Callback):
         workers: int = 1,
     ) -> None:
         self._make_environment, self._seeds, self._workers = make_environment, seeds, workers
-        self._make_player = partial(_Player, make_environment, make_policy)
+        self._make_player = partial(Player, make_environment, make_policy)
         self._pool: ProcessPool | None = None
         self._path = run / BEST
         self._enabled = self._played = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -69,33 +70,27 @@ class TrainingProgressBar(Callback):
     Lightning's own bar labels training without epochs "Epoch 0/-2", and restarts at 0 after resuming.
     """
 
-    READ_EVERY = 10  # batches; each read synchronises the GPU
+    READ_EVERY = 10  # batches; each read of a loss or a metric synchronises the GPU
 
     def __init__(self) -> None:
         self._bar: Bar | None = None  # of the first process, from the first batch on
-        self._loss: float | None = None  # unknown before the first step, also after resuming
+        self._note = ""  # empty before the first step, also after resuming
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Advance the bar; read the loss every `READ_EVERY` batches."""
-        parts, metrics = trainer.accumulate_grad_batches, trainer.callback_metrics
-        if self._loss is None or batch_idx % self.READ_EVERY == 0:
-            self._loss = outputs["loss"].item() * parts  # Lightning divides it by these
+        """Advance the bar; read loss and metrics every `READ_EVERY` batches."""
         if not trainer.is_global_zero:
             return
+        parts = trainer.accumulate_grad_batches
+        if not self._note or batch_idx % self.READ_EVERY == 0:
+            loss = outputs["loss"].item() * parts  # Lightning divides it by these
+            self._note = _note(loss, trainer.callback_metrics)
         if self._bar is None:  # not before, because it is painted over what others say at the start
             total = trainer.max_steps * parts if trainer.max_steps > 0 else None
             self._bar = Bar("training", total, batch_idx)
             self._bar.start()
-        notes = [f"loss {self._loss:.3f}"]
-        if "pace/samples_per_s" in metrics:
-            notes.append(f"{metrics['pace/samples_per_s']:.0f} samples/s")
-        if "val/success" in metrics:
-            notes.append(f"success {metrics['val/success']:.0%}")
-        if metrics.get("pace/waiting", 0) > MAX_WAITING_SHARE:
-            notes.append(f"waiting {metrics['pace/waiting']:.0%}")
-        self._bar.show(batch_idx + 1, ", ".join(notes))
+        self._bar.show(batch_idx + 1, self._note)
 
     def on_train_end(self, *_: Any) -> None:
         """End the bar, also after an error."""
@@ -104,3 +99,15 @@ class TrainingProgressBar(Callback):
             self._bar = None
 
     on_exception = on_train_end
+
+
+def _note(loss: float, metrics: Mapping[str, Any]) -> str:
+    """Describe the state of a training."""
+    notes = [f"loss {loss:.3f}"]
+    if "pace/samples_per_s" in metrics:
+        notes.append(f"{metrics['pace/samples_per_s']:.0f} samples/s")
+    if "val/success" in metrics:
+        notes.append(f"success {metrics['val/success']:.0%}")
+    if metrics.get("pace/waiting", 0) > MAX_WAITING_SHARE:
+        notes.append(f"waiting {metrics['pace/waiting']:.0%}")
+    return ", ".join(notes)

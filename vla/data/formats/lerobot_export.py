@@ -107,10 +107,12 @@ class LeRobotExporter:
         """Write one file of a camera unless it exists; returns histograms of colour values, (3, 256) per episode."""
         camera, file = unit
         histograms: list[Array] = []
+        # Files of the first camera also verify what is not exported; those of the others need not read it again.
+        fields = None if camera == store.spec.cameras[0] else [f"rgb_{camera}"]
 
         def clips() -> Iterator[Array]:
             for entry in store.episodes[file * EPISODES_PER_VIDEO :][:EPISODES_PER_VIDEO]:
-                images = store.read(entry)[f"rgb_{camera}"]
+                images = store.read(entry, fields)[f"rgb_{camera}"]
                 colours = (images[..., colour].ravel() for colour in range(3))
                 histograms.append(np.stack([np.bincount(values, minlength=256) for values in colours]))
                 yield images

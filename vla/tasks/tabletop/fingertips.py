@@ -12,7 +12,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from vla.io.errors import UserError
 from vla.spec import Array
@@ -83,6 +82,8 @@ def _triangles(model: mujoco.MjModel, data: mujoco.MjData, name: str, place: Any
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         vertices, faces = mesh_triangles(model, int(model.geom_dataid[geom]))
     else:
+        from scipy.spatial import ConvexHull  # takes a quarter of a second, and only grippers from files need it
+
         vertices = model.geom_aabb[geom, :3] + np.array([*product((-1, 1), repeat=3)]) * model.geom_aabb[geom, 3:]
         faces = ConvexHull(vertices).simplices
     world = data.geom_xpos[geom] + vertices @ data.geom_xmat[geom].reshape(3, 3).T
