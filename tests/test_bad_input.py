@@ -6,11 +6,13 @@ import re
 from pathlib import Path
 
 import pytest
+import toy
 from command_line import SMALL, here, vla
 from composing import check, composed
 
 from vla.config.build import build
 from vla.config.experiment import to_plain
+from vla.data.episodes import EpisodeStore
 from vla.tasks.gl import WORKING_BACKEND
 
 # Line → what its sentence says.
@@ -69,6 +71,14 @@ def test_bad_input_ends_in_one_clear_sentence(tmp_path: Path, line: str) -> None
     done = here(tmp_path, *line.split(), ok=False)
     assert done.stderr.count("error: ") == 1 and BAD_INPUT[line] in done.stderr and "Traceback" not in done.stderr
     assert all([*run.iterdir()] for run in tmp_path.glob("outputs/runs/*"))  # none is left empty
+
+
+@pytest.mark.parametrize("job", ["train", "improve"])
+def test_a_further_store_of_another_world_is_refused_before_anything_is_collected(tmp_path: Path, job: str) -> None:
+    EpisodeStore.create_or_open(tmp_path / "further", toy.SPEC, {})
+    further = ("collect.more=[further]", "collect.folder=store", "output=run", "hydra.run.dir=run")
+    done = here(tmp_path, *SMALL, f"job={job}", *further, ok=False)
+    assert "error: the model has cameras = " in done.stderr and not (tmp_path / "store").exists()
 
 
 # Job → values that no experiment can have, each of which is refused by the name of its key before any work.

@@ -151,10 +151,14 @@ def test_a_store_of_another_task_is_refused(tmp_path: Path) -> None:
 
 def test_an_episode_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     store, seen = add(tmp_path, []), EPISODES[0].observations
+    lost = [*seen[:-1], replace(seen[-1], state=seen[-1].state * np.nan)]
     small, blind = [replace(each, state=each.state[:6]) for each in seen], [replace(each, rgb={}) for each in seen]
     for says, episode in {
         r"state must be \(12, 15\) float32, got \(12, 6\)": replace(EPISODES[0], observations=small),
         "an observation lacks 'front', which the spec names": replace(EPISODES[0], observations=blind),
+        "seed 0: state has numbers that are not finite": replace(EPISODES[0], observations=lost),
+        "seed 0: action has numbers that are not finite": replace(EPISODES[0], actions=EPISODES[0].actions * np.inf),
+        "an episode store keeps finite numbers": replace(EPISODES[0], draws={"distance": np.nan}),
     }.items():
         with store.writing(), pytest.raises(ValueError, match=says):
             store.append(episode)

@@ -87,6 +87,20 @@ def test_an_import_goes_on_where_it_was(home: Path, tmp_path: Path) -> None:
         imported(home / "dataset", tmp_path / "store", episodes=4)
 
 
+class InDoubles(LeRobotDemonstrations):
+    """A recording whose states have more digits than a store keeps."""
+
+    def numbers(self, number: int) -> tuple[str, np.ndarray, np.ndarray]:
+        instruction, state, actions = super().numbers(number)
+        return instruction, state + np.float64(1e-9), actions
+
+
+def test_a_recording_of_more_digits_is_the_stored_one(home: Path, tmp_path: Path) -> None:
+    expert = InDoubles(**defaults_of("expert/lerobot", folder=home / "dataset"), spec=ARM_SPEC)
+    store = EpisodeStore.create_or_open(tmp_path, expert.spec, {})
+    assert [expert.fill(store, episodes) for episodes in (1, 3)] == [1, 2]
+
+
 def test_an_edited_dataset_is_not_taken_for_what_was_imported(home: Path, tmp_path: Path) -> None:
     store = Path(shutil.copytree(home / "imported", tmp_path / "store"))
     edited = changed(home, tmp_path / "edited")

@@ -13,6 +13,8 @@ from fake_batch import as_policy, make_act
 from toy_recordable import RecordableEnvironment
 
 from vla.data.episodes import EpisodeStore
+from vla.data.verification import episode_of
+from vla.io.errors import UserError
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.memorisation import AgentWithoutModality, Modality, NearestDemonstration, open_memory
 from vla.rollouts.rollout import rollout
@@ -92,6 +94,20 @@ def test_demonstrations_with_images_of_another_size_are_replayed(folder: Path) -
 def _first_action(agent: NearestDemonstration, observation: Observation, seed: int = 0) -> Array:
     agent.reset(observation.instruction, seed)
     return agent.act(observation)
+
+
+def test_another_part_of_the_same_recording_is_no_other_demonstration(folder: Path, tmp_path: Path) -> None:
+    source = EpisodeStore(folder)
+    first, other = (episode_of(source, entry) for entry in source.episodes[:2])
+    parts = EpisodeStore.create_or_open(tmp_path, toy.SPEC.without_truth, {})
+    with parts.writing():
+        for seed, (whole, recording) in enumerate([(first, 0), (first, 0), (other, 1)]):
+            parts.append(replace(whole, seed=seed, draws={"recorded": {"episode": recording}}))
+    agent, seen = NearestDemonstration(tmp_path, None, spec=toy.SPEC), first.observations[0]
+    assert np.array_equal(_first_action(agent, seen, seed=1), other.executed[0])
+    assert np.array_equal(_first_action(agent, seen, seed=2), first.executed[0])
+    with pytest.raises(UserError, match="has no other recording than the one that is shown"):
+        _first_action(NearestDemonstration(tmp_path, 2, spec=toy.SPEC), seen, seed=1)
 
 
 def test_new_scenes_are_mostly_failed_and_other_stores_refused(folder: Path, tmp_path: Path) -> None:

@@ -178,9 +178,13 @@ def test_a_repaired_import_goes_on(dataset: Path, tmp_path: Path) -> None:
     assert [entry.seed for entry in store.episodes] == [0, *range(2, EPISODES)]
     with pytest.raises(ValueError, match=rf"only {EPISODES - 1} whole episodes"):
         recorded.fill(EpisodeStore(tmp_path / "store"), EPISODES)
-    derive_store([EpisodeStore(tmp_path / "store")], tmp_path / "chosen", {"seed": 0})
-    with pytest.raises(ValueError, match=r"cannot grow: set collect\.episodes=1"):
-        recorded.fill(EpisodeStore(tmp_path / "chosen"), EPISODES - 1)
+    other = EpisodeStore.create_or_open(tmp_path / "other", spec, {"expert": "another"})
+    with other.writing():
+        other.append(replace(recorded.episode(1), seed=0))
+    for name, sources in {"chosen": [EpisodeStore(tmp_path / "store")], "merged": [other, store]}.items():
+        derive_store(sources, tmp_path / name, {"seed": 0})
+        with pytest.raises(ValueError, match=rf"cannot grow: set collect\.episodes={len(sources)}"):
+            recorded.fill(EpisodeStore(tmp_path / name), EPISODES - 1)
 
 
 def test_outliers_do_not_widen_the_bounds_and_rare_events_do() -> None:

@@ -45,6 +45,15 @@ def digest_of(episodes: Sequence[Entry]) -> str:
     return hashlib.sha256(entries.encode()).hexdigest()[:12]
 
 
+def require_trainable(spec: Spec, stores: Iterable[EpisodeStore]) -> None:
+    """Raise a UserError unless the stores have what a model with this spec is trained on; they may lack its truth."""
+    for store in stores:
+        name = f"the episode store {store.folder}"
+        spec.require_input(store.spec, "the model", name)
+        if store.spec.truth:
+            replace(store.spec, truth=spec.truth).require(store.spec, "the model", name)
+
+
 class Prefetcher:
     """Iterable of batches, made by one background thread.
 
@@ -142,11 +151,8 @@ class WindowDataModule(LightningDataModule):
         counts = [store.episodes[-1].end if store.episodes else 0 for store in stores]
         self._starts = np.cumsum([0, *counts[:-1]])
         training, holdout = list[Array](), list[Array]()
+        require_trainable(self._spec, stores)
         for store, offset in zip(stores, self._starts, strict=True):
-            name = f"the episode store {store.folder}"
-            self._spec.require_input(store.spec, "the model", name)
-            if store.spec.truth:  # a further store may lack it, which becomes NaN
-                replace(store.spec, truth=self._spec.truth).require(store.spec, "the model", name)
             for entry in store.episodes:
                 windows = holdout if is_held_out(recording_of(entry), self._fraction) else training
                 windows.append(offset + np.arange(entry.start, entry.end))

@@ -354,6 +354,8 @@ def rows_of(spec: Spec, episode: Episode) -> dict[str, Array]:
         if column.shape != (len(steps), *shape) or not np.can_cast(column.dtype, dtype, "same_kind"):
             raise UserError(f"{name} must be {(len(steps), *shape)} {dtype}, got {column.shape} {column.dtype}")
         rows[name] = np.ascontiguousarray(column, dtype)
+        if dtype.kind == "f" and not np.isfinite(rows[name]).all():
+            raise UserError(f"seed {episode.seed}: {name} has numbers that are not finite")
     return rows
 
 

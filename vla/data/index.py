@@ -108,8 +108,13 @@ def _seal(body: bytes) -> bytes:
 
 
 def dumps(value: Any) -> str:
-    """Encode as JSON on one line, with arrays as lists; a UserError for other types than JSON has."""
-    return json.dumps(value, default=_to_plain, allow_nan=False, ensure_ascii=False)
+    """Encode as JSON on one line, with arrays as lists; a UserError for other types and numbers than JSON has."""
+    try:
+        return json.dumps(value, default=_to_plain, allow_nan=False, ensure_ascii=False)
+    except UserError:
+        raise
+    except ValueError as error:
+        raise UserError(f"an episode store keeps finite numbers: {error}") from error
 
 
 def _to_plain(value: Any) -> Any:

@@ -19,6 +19,7 @@ from vla.config.check import devices
 from vla.config.differences import value_at
 from vla.config.experiment import Experiment
 from vla.config.nodes import Rounds, with_changes
+from vla.data.datamodule import require_trainable
 from vla.data.episodes import EpisodeStore
 from vla.data.header import is_store
 from vla.data.index import format_numbers
@@ -99,6 +100,7 @@ def _require_possible(experiment: Experiment) -> range:
         expert = experiment.make_expert()(environment)
         close_agent(expert)
         require_memoryless(expert)
+        require_trainable(environment.spec, map(EpisodeStore, experiment.collect.more or ()))
         if (policy := experiment.pretrained) is not None:
             read_policy(policy).spec.require_input(environment.spec, f"the checkpoint {policy}", "the task")
         with closing(experiment.make_environment(options.changes)()) as variant:

@@ -15,7 +15,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from vla.config.experiment import Experiment, training_policy
-from vla.data.datamodule import WindowDataModule
+from vla.data.datamodule import WindowDataModule, require_trainable
 from vla.data.episodes import EpisodeStore
 from vla.io.errors import UserError, counted
 from vla.io.files import atomic_path, remove_drafts, warn_on_error, writing
@@ -124,7 +124,9 @@ def _fit(experiment: Experiment, last: Path | None, trainer: Trainer, graceful_s
     with explain_memory_errors(experiment.config), graceful_stop.explaining_restore(last):
         spec = demonstration_spec(experiment)
         learner = experiment.learner(spec, origin, last)
-    store, model = demonstrations(experiment), learner.model
+    model = learner.model
+    require_trainable(model.spec, extra_stores)  # before episodes are collected
+    store = demonstrations(experiment)
     if origin is last is None:
         experiment.fit_tokenizer(model.tokenizer, store)
         frozen = experiment["learner"].get("frozen", ())

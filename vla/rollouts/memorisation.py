@@ -9,6 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from vla.data.episodes import EpisodeStore
+from vla.data.index import recording_of
+from vla.io.errors import UserError
 from vla.io.images import resize
 from vla.io.types import Count
 from vla.rollouts.rollout import AgentFactory, close_agent
@@ -63,9 +65,9 @@ def make_agent_without(make_agent: AgentFactory, modality: Modality, environment
 class NearestDemonstration:
     """Replays the demonstration with the most similar first images, whatever happens; then repeats its last action.
 
-    The demonstration has another seed and, if one exists, the same instruction. The distance of two first images is the
-    mean absolute difference over every `STRIDE`th row and column of all cameras, at the size of the demonstrations.
-    This baseline for memorisation succeeds where remembering the demonstrations is enough.
+    The demonstration has another seed, is of another recording and, if one exists, has the same instruction. The
+    distance of two first images is the mean absolute difference over every `STRIDE`th row and column of all cameras, at
+    the size of the demonstrations. This baseline for memorisation succeeds where remembering demonstrations is enough.
     """
 
     def __init__(self, folder: Path, episodes: Count | None, *, spec: Spec) -> None:
@@ -74,9 +76,10 @@ class NearestDemonstration:
         Raises as `open_memory`.
         """
         store = open_memory(folder, episodes, spec)
-        self._entries, self._executed = store.episodes, store.rows("executed")
+        self._folder, self._entries, self._executed = folder, store.episodes, store.rows("executed")
         self._instructions = np.array([entry.instruction for entry in self._entries])
         self._seeds = np.array([entry.seed for entry in self._entries])
+        self._recordings = np.array([recording_of(entry) for entry in self._entries])
         rows = [store.rows(f"rgb_{camera}") for camera in spec.cameras]
         starts = [entry.span.start for entry in self._entries]
         images = [[_subsample(array[start : start + 1])[0] for array in rows] for start in starts]
@@ -89,7 +92,8 @@ class NearestDemonstration:
         """Start an episode; the demonstration is chosen at the first action."""
         self._actions: Array | None = None
         self._step = 0
-        self._other_seeds = self._seeds != seed  # a recording must not be its own memory
+        own_recordings = self._recordings[self._seeds == seed]  # a recording must not be its own memory
+        self._others = ~np.isin(self._recordings, own_recordings)
 
     @property
     def looks(self) -> bool:
@@ -107,8 +111,10 @@ class NearestDemonstration:
     def _nearest_index(self, observation: Observation) -> int:
         images = [_subsample(resize(observation.rgb[camera], self._size)) for camera in self._cameras]
         query = np.stack(images).astype(np.int16)
-        same_instruction = np.flatnonzero(self._other_seeds & (self._instructions == observation.instruction))
-        candidates = same_instruction if len(same_instruction) else np.flatnonzero(self._other_seeds)
+        same_instruction = np.flatnonzero(self._others & (self._instructions == observation.instruction))
+        candidates = same_instruction if len(same_instruction) else np.flatnonzero(self._others)
+        if not len(candidates):
+            raise UserError(f"{self._folder} has no other recording than the one that is shown: name a larger store")
         distances = [np.abs(self._images[index] - query).mean() for index in candidates]
         return int(candidates[np.argmin(distances)])
 

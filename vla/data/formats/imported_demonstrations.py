@@ -94,8 +94,8 @@ class ImportedDemonstrations(ABC):
         self.require_enough(episodes)
         if episodes < len(self):
             log.info("collect.episodes=%d of the %d recorded episodes are used", episodes, len(self))
-        self.require_held(store)
         store.require_growable()
+        self.require_held(store)
         with store.writing():  # another process may have added some meanwhile
             next_seed = store.next_seed or 0
             if (limit := len(store.episodes) + len(self) - next_seed) < episodes:  # damaged ones are not imported again
@@ -120,7 +120,7 @@ class ImportedDemonstrations(ABC):
             if entry.seed >= len(self):
                 continue
             instruction, state, action = self.numbers(entry.seed)
-            action = self._clip(action)
+            state, action = np.asarray(state, np.float32), self._clip(action)
             same = np.array_equal(states[entry.span], state) and np.array_equal(actions[entry.span], action)
             if entry.instruction != instruction or not same:
                 raise UserError(
