@@ -28,6 +28,13 @@ def test_an_evaluation_without_a_trained_policy_is_refused_before_other_stages(t
     assert not list(tmp_path.iterdir())
 
 
+def test_training_on_several_devices_is_refused_as_every_process_would_measure_its_own(tmp_path: Path) -> None:
+    asked = ("trainer=ddp", "trainer.devices=2", "benchmark.names=[loader,train]", f"output={tmp_path}/run")
+    with pytest.raises(UserError, match=r"measures training on one device: add trainer\.devices=1"):
+        run(Experiment.from_config(composed("job=benchmark", *asked)))
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("names", ["[collect]", "[train,evaluate]"])
 def test_recordings_are_measured_where_nothing_is_played(recording: None, tmp_path: Path, names: str) -> None:
     asked = ("task=recorded", "job=benchmark", f"benchmark.names={names}", f"output={tmp_path}/run")

@@ -191,6 +191,15 @@ def test_conditions_of_an_evaluation_are_checked_with_the_task_that_they_change(
         check(composed("+validate.changes.bloks=3"))
 
 
+@pytest.mark.parametrize(
+    ("override", "says"), [("policy.lanes=0", r"policy\.lanes must be"), ("~policy", "policy must be")]
+)
+def test_the_policy_that_validation_plays_is_checked_before_training(override: str, says: str) -> None:
+    check(composed("job=train", override, "validate.episodes=0"))
+    with pytest.raises(ValueError, match=says):
+        check(composed("job=train", override))
+
+
 def test_published_statistics_need_a_policy_that_has_some() -> None:
     asked = ("job=train", "model=smolvla", "model.statistics=pretrained")
     with pytest.raises(ValueError, match=r"^model\.statistics=pretrained needs a published policy: add pretrained="):

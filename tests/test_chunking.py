@@ -289,6 +289,7 @@ def test_what_cannot_continue_plans_is_refused() -> None:
     with pytest.raises(ValueError, match=r"model\.chunk=8 has no room for model\.prefix=7 and model\.execute=2"):
         make_flow(prefix=7)
     require_fit(TrainedPrefix, {"chunk": 8, "execute": 2, "prefix": 4}, delay=4)
+    require_fit(Guided, {"chunk": 8}, delay=0)  # `execute` has a default
     with pytest.raises(ValueError, match=r"begin 5 actions apart and arrive 5 late, when .* model\.chunk=8, is over"):
         require_fit(Guided, {"chunk": 8, "execute": 2}, delay=5)
     with pytest.raises(ValueError, match=r"3 actions late, more than model\.prefix=2: train"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -44,6 +45,16 @@ def test_a_context_has_its_length_and_sees_images_state_and_instruction(context:
 def test_any_head_learns_with_any_context(head: str, context: str) -> None:
     model = made(head, context)
     assert overfit(model, with_text(model, make_batch(model.history, 2)), steps=120) < 0.08
+
+
+@pytest.mark.parametrize("head", ["act", "flow", "decoder"])
+def test_a_state_of_rates_alone_is_left_out(head: str) -> None:
+    spec = replace(SPEC, state_units=("m/s", "m/s"))
+    model = MODELS[head](context=context_of("model/act", keypoints=8), spec=spec)
+    batch = with_text(model, make_batch(1, model.chunk, spec=spec))
+    assert model.loss(batch)["loss"].isfinite()
+    actions = model.eval().predict(batch).actions
+    assert torch.equal(model.predict({**batch, "state": batch["state"] + 1}).actions, actions)
 
 
 @pytest.mark.parametrize("head", ["act", "flow", "decoder"])

@@ -61,6 +61,22 @@ def test_a_condition_without_an_episode_is_refused_before_any_is_played() -> Non
         require_possible(Experiment.from_config(asked))
 
 
+@pytest.mark.parametrize(
+    ("policy", "says"),
+    [
+        (["policy.device=cuda"], r"policy\.device=cuda, but PyTorch finds no GPU"),
+        (["policy=onnx", "model=decoder", "tokenizer=fast"], "Decoder with Fast cannot be exported"),
+    ],
+)
+def test_a_policy_that_cannot_run_here_is_refused_before_it_is_trained(
+    policy: list[str], says: str, tmp_path: Path
+) -> None:
+    place = f"output={tmp_path}/run"
+    with pytest.raises(ValueError, match=says):
+        require_possible(Experiment.from_config(composed(*policy, place)))
+    require_possible(Experiment.from_config(composed(*policy, place, "agent=expert")))
+
+
 def test_the_report_of_rounds_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "round_0/checkpoints").mkdir(parents=True)
     with pytest.raises(ValueError, match="has the rounds of a job=improve, whose report this would replace"):

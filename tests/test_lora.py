@@ -149,6 +149,14 @@ def test_frozen_parts_learn_by_their_factors_alone_at_a_rate_of_their_own() -> N
     assert not any(id(weight) in rates for weight in model.context.parameters()) and id(model.head.weight) in rates
 
 
+def test_every_factor_has_an_effect_and_keypoints_without_any_stay_trained() -> None:
+    model = make_act()
+    lora("context").inject(model)
+    model.loss(with_text(model, make_batch(1, model.chunk)))["loss"].backward()
+    assert all(weight.grad is not None for weight in model.parameters() if weight.requires_grad)
+    assert model.get_parameter("context.features.keypoints.0.score.weight").requires_grad
+
+
 @pytest.mark.parametrize("module", ["q_prj", "encoder.layers.0.self_attn", "text"])
 def test_a_name_of_no_linear_map_is_told_with_those_there_are(module: str) -> None:
     says = rf"lora\.modules names {module}, which matches no linear map .*: there are .*linear1, linear2.* in .*decoder"

@@ -45,6 +45,14 @@ class _Lane:
     info: dict[str, Any] = field(default_factory=dict)  # about the last action
 
 
+def torch_device(device: Literal["auto", "cpu", "cuda"]) -> torch.device:
+    """Return the device that `policy.device` names; a UserError if that is a GPU, and there is none."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise UserError("policy.device=cuda, but PyTorch finds no GPU here: policy.device=auto uses the CPU")
+    best_device = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(best_device if device == "auto" else device)
+
+
 class Policy:
     """Agents that share a model: each caches encoded frames of its history, and executes the first actions of a chunk.
 
@@ -78,10 +86,7 @@ class Policy:
         model: Model,
         spec: Spec,
     ) -> None:
-        if device == "cuda" and not torch.cuda.is_available():
-            raise UserError("policy.device=cuda, but PyTorch finds no GPU here: policy.device=auto uses the CPU")
-        best_device = "cuda" if torch.cuda.is_available() else "cpu"
-        self.device = torch.device(best_device if device == "auto" else device)
+        self.device = torch_device(device)
         self.model, self.spec, self.lanes = model.eval().to(self.device), spec, lanes
         self.chunking = chunking
         if chunking is not None:

@@ -137,6 +137,8 @@ def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None
         conditions = {f"evaluate.conditions.{name}": changes for name, changes in evaluate.changes.items()}
     if "learner" in groups and validate.episodes and settings.checkpoint is None:  # a checkpoint is not trained
         conditions["validate.changes"] = validate.changes
+        # Episodes of a validation take the policy's lanes and precision, and need none of its libraries.
+        _check_group(experiment.nodes.get("policy"), GROUPS["policy"], may_lack=True)
     if "improve" in groups:
         conditions["improve.changes"] = experiment.options(Rounds).changes
     for name, changes in conditions.items():

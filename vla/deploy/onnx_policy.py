@@ -24,6 +24,7 @@ from vla.io.documents import lines_of
 from vla.io.errors import UserError
 from vla.io.files import atomic_path, write_json
 from vla.io.types import Text
+from vla.models.decoder import Decoder
 from vla.models.model import Batch, Model, Prediction
 from vla.policy import Policy
 from vla.spec import Spec
@@ -68,6 +69,13 @@ class OnnxPolicy(Policy):
     differ from the model by at most a thousandth of the range of an action, on an episode of noise, return no
     probabilities, and take one observation at a time. Raises a UserError if the model cannot be exported.
     """
+
+    @staticmethod
+    def require_exportable(model: type, tokenizer: type) -> None:
+        """Raise a UserError if models of a class decode sequences of varying length with a class of tokenizers."""
+        if issubclass(model, Decoder) and getattr(tokenizer, "end", -1) >= 0:
+            names = f"{model.__name__} with {tokenizer.__name__}"
+            raise UserError(f"{names} cannot be exported, as its sequences vary in length: use policy=default")
 
     def __init__(self, folder: Text | Path, *, model: Model, spec: Spec) -> None:
         super().__init__("cpu", "fp32", compile=False, lanes=1, model=model, spec=spec)

@@ -26,7 +26,7 @@ from vla.io.printable import escape, show
 from vla.io.versions import installed_versions
 from vla.models.chunking import require_fit
 from vla.models.policy_folder import read_policy, require_unseen
-from vla.policy import costs
+from vla.policy import costs, torch_device
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.result_tables import conditions_table, plot_conditions, secondary_table
 from vla.reports.run_page import write_page
@@ -211,14 +211,16 @@ def _play(
 def require_possible(experiment: Experiment) -> None:
     """Check, before any work, that the evaluation can be completed.
 
-    Raises a UserError if the run to compare with or a store is missing, there is nothing to decide, a network or a
-    condition is impossible, or the episodes selected the weights or are not distinct.
+    Raises a UserError if the run to compare with or a store is missing, there is nothing to decide, a policy, a network
+    or a condition is impossible, or the episodes selected the weights or are not distinct.
     """
     options, settings = experiment.evaluate, experiment.settings
     for name in (settings.checkpoint, settings.pretrained):
         if name:
             require_unseen(name, "evaluate.seed", options.seeds)  # whatever `validate` is now
     _statements(experiment)
+    if not experiment.nodes.get("agent"):
+        _require_usable(experiment)
     for node in options.networks.values():
         network = build(node, NETWORK)
         if (chunking := (experiment.nodes.get("policy") or {}).get("chunking")) and not experiment.nodes.get("agent"):
@@ -245,6 +247,15 @@ def require_possible(experiment: Experiment) -> None:
         for name, changes in {IN_DISTRIBUTION: {}, **options.changes}.items():
             with closing(experiment.make_environment(changes)()) as world:
                 _require_distinct(name, world, options)
+
+
+def _require_usable(experiment: Experiment) -> None:
+    """Raise a UserError if the policy, which may have to be trained first, lacks a GPU or cannot be exported."""
+    kind: Any = experiment.kind("policy")
+    if experiment["policy"].get("device") == "cuda":
+        torch_device("cuda")
+    if hasattr(kind, "require_exportable"):
+        kind.require_exportable(experiment.kind("model"), experiment.kind("tokenizer"))
 
 
 def _require_distinct(condition: str, world: Any, options: Evaluation) -> None:

@@ -123,7 +123,7 @@ def require_prefix(prefix: int, execute: int, chunk: int) -> None:
 def require_fit(method: type, model: Mapping[str, Any], delay: int) -> None:
     """Raise a UserError if chunks or trained prefixes of a model, given by its node, are too short for a delay."""
     chunk = model["chunk"]
-    interval = max(delay, model["execute"] or chunk)  # between one plan and the next
+    interval = max(delay, model.get("execute") or chunk)  # between one plan and the next
     if delay + interval > chunk:
         raise UserError(
             f"plans begin {counted(interval, 'action')} apart and arrive {delay} late, when the one before, of "

@@ -138,7 +138,7 @@ class KeypointContext(Context):
         features = [*images, *state, text]
         summary = self.fuse(torch.cat(features, -1))
         tokens = [linear(feature) for linear, feature in zip(self.tokens, features, strict=True)]
-        return EncodedContext(torch.stack([summary, *tokens], 1), summary, state=state[0] if state else None)
+        return EncodedContext(torch.stack([summary, *tokens], 1), summary, state=state[0] if self.state_width else None)
 
 
 class TokenContext(Context):

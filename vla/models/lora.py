@@ -15,6 +15,7 @@ from torch import nn
 from vla.io.errors import UserError
 from vla.io.types import Count, Names, Positive, Rate
 from vla.models.trunk import is_factor, is_within
+from vla.models.vision.image_tokenizer import Keypoints
 
 ADAPTER = "default"  # peft's name for the only adapter
 
@@ -58,9 +59,9 @@ class LoRA:
 
     def _target_modules(self, model: nn.Module) -> list[str]:
         modules, targets = dict(model.named_modules()), dict[str, None]()
-        # The linear maps in torch's attention are not called as modules, so factors in them would have no effect.
-        attention = [name for name, module in modules.items() if isinstance(module, nn.MultiheadAttention)]
-        linear = [name for name in modules if isinstance(modules[name], nn.Linear) and not is_within(name, attention)]
+        # The linear maps in these are not called as modules, so factors in them would have no effect.
+        others = [name for name, module in modules.items() if isinstance(module, nn.MultiheadAttention | Keypoints)]
+        linear = [name for name in modules if isinstance(modules[name], nn.Linear) and not is_within(name, others)]
         for pattern in self.modules:
             matches = [name for name in linear if fnmatchcase(f".{name}.", f"*.{pattern}.*")]
             if not matches:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from importlib import import_module
 
+from vla.config.check import devices
 from vla.config.experiment import Experiment
 from vla.config.nodes import Benchmark
 from vla.io.errors import UserError
@@ -28,7 +29,7 @@ def run(experiment: Experiment) -> dict[str, Measure]:
     """Measure the stages in `benchmark.names`, print a table and write `benchmark.json`; returns name → measure.
 
     Both name the processor, and how many of its cores other programs used during a stage. Raises a UserError if there
-    is no policy to evaluate, or nothing can be played.
+    is no policy to evaluate, nothing can be played, or training is on several devices.
     """
     host, measures, names = machine(), dict[str, Measure](), experiment.options(Benchmark).names
     # Before any stage, because they take minutes.
@@ -39,6 +40,8 @@ def run(experiment: Experiment) -> dict[str, Measure]:
         )
     if "evaluate" in names and experiment.checkpoint is None:
         raise UserError("benchmark.names=[evaluate] plays a trained policy: add checkpoint=RUN")
+    if "train" in names and devices(experiment["trainer"]) > 1:
+        raise UserError("job=benchmark measures training on one device: add trainer.devices=1")
     for name in names:
         stage, (start_load, start) = getattr(import_module(f"{__name__}.{MODULES.get(name, name)}"), name), other_load()
         stage_measures, (end_load, end) = stage(experiment), other_load()
