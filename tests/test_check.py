@@ -117,6 +117,12 @@ def test_a_digest_that_is_none_is_named_with_its_pattern() -> None:
         check(composed("job=train", *chosen))
 
 
+@pytest.mark.parametrize("policy", ["checkpoint", "pretrained", "resume"])
+def test_an_agent_and_a_policy_are_not_both_taken(policy: str) -> None:
+    with pytest.raises(ValueError, match=rf"^agent=OPTION and {policy}=RUN are two policies: omit one of them"):
+        check(composed("agent=expert", f"{policy}=run"))
+
+
 def test_a_job_needs_its_groups_and_looks_at_no_others() -> None:
     assert "job=collect needs expert" in problem(expert=None)
     check(config(deploy={"_target_": "vla.nowhere.Nothing"}))

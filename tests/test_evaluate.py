@@ -83,6 +83,13 @@ def test_the_report_of_rounds_is_not_replaced(tmp_path: Path) -> None:
         require_possible(Experiment.from_config(composed(f"output={tmp_path}", "agent=expert")))
 
 
+@pytest.mark.parametrize("trained", ["policy", "checkpoints/last.ckpt"])
+def test_the_report_of_a_training_is_not_replaced_by_that_of_another_agent(tmp_path: Path, trained: str) -> None:
+    (tmp_path / trained).mkdir(parents=True)
+    with pytest.raises(ValueError, match="has a training of its own, whose report this would replace: add output=DIR"):
+        require_possible(Experiment.from_config(composed(f"output={tmp_path}", "agent=expert")))
+
+
 def of_ten(**won: int) -> tuple[Result, ...]:
     """Ten episodes of each task, of which so many succeed."""
     outcomes = [(task, "success" if n < count else "lost") for task, count in won.items() for n in range(10)]

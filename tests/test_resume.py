@@ -62,6 +62,8 @@ def test_a_run_is_resumed_with_its_config_in_its_folder(tmp_path: Path) -> None:
     assert (resumed.trainer.max_steps, resumed.trainer.precision) == (9, "bf16")  # of the run, not of trainer=auto
     longer = resume(now, tmp_path / "one", ["trainer={max_steps: 12}"])  # which merges, as in Hydra
     assert (longer.trainer.max_steps, longer.trainer.precision) == (12, "bf16")
+    with pytest.raises(ValueError, match=r"one continues in its own folder: omit output=.*now"):
+        resume(now, tmp_path / "one", [f"output={tmp_path}/now"])
     with pytest.raises(ValueError, match="omit checkpoint="):
         resume(composed(f"output={tmp_path}/now", "checkpoint=x"), tmp_path / "one", [])
     with pytest.raises(ValueError, match="other has no training to continue"):
@@ -96,6 +98,12 @@ def test_a_run_continues_in_its_folder(tmp_path: Path, finished: bool, chosen: b
         key = other.strip("+").partition("=")[0]
         with pytest.raises(ValueError, match=rf"differs in {re.escape(key)}: choose another output=DIR"):
             training_progress(tmp_path, to_plain(composed(other)))
+
+
+def test_a_training_does_not_begin_in_the_folder_of_rounds(tmp_path: Path) -> None:
+    (tmp_path / "round_1/checkpoints").mkdir(parents=True)
+    with pytest.raises(ValueError, match="has the rounds of a job=improve: continue them by that job"):
+        training_progress(tmp_path, to_plain(composed("job=train")))
 
 
 def test_a_finished_training_needs_no_checkpoint(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -345,6 +345,14 @@ def test_a_bug_gives_a_traceback_and_so_does_a_mistake_where_asked(
         here(tmp_path, "job=report")
 
 
+def test_variants_are_found_in_a_folder_of_options_of_the_user(tmp_path: Path) -> None:
+    (tmp_path / "mine/experiment").mkdir(parents=True)
+    text = "# @package _global_\nvariant: equal\nvariants:\n  equal: ['plan.rates=[0.5,0.5]']\n"
+    (tmp_path / "mine/experiment/mine.yaml").write_text(text)
+    refused = here(tmp_path, "job=plan", "--config-dir", "mine", "experiment=mine", ok=False)
+    assert "are equal: no number of episodes tells them apart" in refused.stderr, refused.stderr
+
+
 def test_a_training_that_goes_on_archives_its_evaluation(home: Path) -> None:
     shutil.copytree(home / "run", home / "longer")
     done = here(home, "job=train", "resume=longer", "output=longer", "trainer.max_steps=6")

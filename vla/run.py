@@ -107,9 +107,12 @@ def _is_mendable(error: Exception) -> bool:
 
 
 def _require_sweepable(experiment: Experiment, groups: Container[str]) -> None:
-    """Refuse a grid without -m or beside another grid, cells that share a folder, and cells on several devices."""
+    """Refuse a grid without -m or beside another grid, folders of cells that no table finds, or that several cells
+    share, and cells on several devices."""
     config = HydraConfig.get()
-    pairs = {key: value for key, _, value in (override.partition("=") for override in config.overrides.task)}
+    pairs = {
+        key.lstrip("+"): value for key, _, value in (override.partition("=") for override in config.overrides.task)
+    }
     name, params = config.runtime.choices["experiment"], config.sweeper.params or {}
     if config.mode != RunMode.MULTIRUN:
         if params:
@@ -119,6 +122,11 @@ def _require_sweepable(experiment: Experiment, groups: Container[str]) -> None:
         raise UserError(f"experiment={name} is a grid of its own: run it without other experiments")
     if "${" not in pairs.get("output", "${"):
         raise UserError(f"output={pairs['output']} would be every cell's folder: name the sweep's, hydra.sweep.dir=DIR")
+    if Path(config.runtime.output_dir).parent.resolve() != Path(config.sweep.dir).resolve() or not config.output_subdir:
+        raise UserError(
+            f"hydra.sweep.subdir={config.sweep.subdir} and hydra.output_subdir={config.output_subdir}: a sweep's table "
+            "needs a single name for each cell, and a folder of Hydra in it: omit the two"
+        )
     slurm = config.runtime.choices["hydra/launcher"] == "submitit_slurm"
     if "trainer" in groups and not slurm and devices(experiment["trainer"]) > 1:
         # Processes that a trainer starts repeat the command line, here the whole sweep.
@@ -242,6 +250,17 @@ def _compose(cfg: DictConfig) -> float | None:
         _end(error)
 
 
+def _options_first(arguments: list[str]) -> list[str]:
+    """Move overrides behind the options, because argparse takes them from one place only."""
+    options, overrides, before = list[str](), list[str](), ""
+    for argument in arguments:
+        is_value = before.startswith(("-c", "--config")) and "=" not in before  # of an option
+        is_override = not is_value and argument[:1] != "-" and ("=" in argument or argument[:1] == "~")
+        (overrides if is_override else options).append(argument)
+        before = argument
+    return options + overrides
+
+
 def _require_plain(arguments: list[str]) -> None:
     """Refuse arguments that Hydra would answer with its usage message or a traceback, and its option that loads a
     config from a pickle, which may execute any code; options can be abbreviated."""
@@ -289,7 +308,8 @@ def main() -> None:
     sys.excepthook = lambda _, bug, __: sys.stderr.write(escape("".join(traceback.format_exception(bug))))
     os.environ.setdefault(TRACEBACKS, os.environ.get("HYDRA_FULL_ERROR", "0"))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself
-    sys.argv[1:], ros.arguments[:] = ros.split_arguments(sys.argv[1:])
+    arguments, ros.arguments[:] = ros.split_arguments(sys.argv[1:])
+    sys.argv[1:] = _options_first(arguments)
     try:
         _require_plain(sys.argv[1:])
         _require_options(sys.argv[1:])

@@ -106,7 +106,7 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
 
     The command line overrides the saved config. Of a `trainer` option that it chooses, only the keys in `MACHINES` are
     taken. `require_identity` refuses a change of a key in `IDENTITY` when training starts. Raises a UserError if the
-    folder has no training, is not one of the user's own runs, or `cfg` names another policy.
+    folder has no training, is not one of the user's own runs, or `cfg` names another policy or another folder.
     """
     if cfg.checkpoint is not None or cfg.pretrained is not None:
         raise UserError(f"resume={cfg.resume} continues a run unchanged: omit checkpoint= and pretrained=")
@@ -121,6 +121,8 @@ def resume(cfg: DictConfig, run: Path, overrides: Sequence[str]) -> DictConfig:
         raise UserError(f"resume={run} is a training without rounds: job=improve pretrained={run} improves it")
     job = str(saved_config.get("job")).rpartition(".")[2]  # a job has a node of its own
     parsed, names = _parse(overrides, ("experiment",)), {*map(str, cfg), job} - {"output", "resume", "trust"}
+    if run.resolve() != output and any(_path(override) == "output" for override in parsed):
+        raise UserError(f"resume={run} continues in its own folder: omit output={cfg.output}")
     nodes = {name: node for name, node in saved_config.items() if name in names}
     require_trust(nodes, nodes, file)
     if "trainer" in _replaced_paths(parsed):

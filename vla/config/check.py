@@ -72,8 +72,9 @@ def _check(experiment: Experiment, job: Job) -> None:
     if config.get("agent") is not None:
         if "agent" not in groups:
             raise UserError(f"job={settings.job} takes no agent: agent=OPTION goes with job=evaluate and deploy")
-        if settings.checkpoint is not None:
-            raise UserError("agent=OPTION and checkpoint=RUN are two policies: omit one of them")
+        for name in ("checkpoint", "pretrained", "resume"):
+            if config.get(name) is not None:
+                raise UserError(f"agent=OPTION and {name}=RUN are two policies: omit one of them")
     for name, group in groups.items():
         if config.get(name) is not None:
             _check_group(config[name], group, may_lack=name in job.stored)

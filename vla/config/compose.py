@@ -15,6 +15,7 @@ from hydra._internal.config_repository import ConfigRepository
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
 
@@ -61,11 +62,11 @@ def with_variant(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
         raise UserError(f"there is no variant={name}{hint or ': choose an experiment that has it'}")
     changes = to_plain(variants)[name]
     check_value(f"variants.{name}", changes, list[str])
-    overrides_by_key = {override.partition("=")[0]: override for override in overrides}
+    overrides_by_key = {override.partition("=")[0].lstrip("+"): override for override in overrides}
     for change in changes:
         if contrary := overrides_by_key.get(change.partition("=")[0]):
             raise UserError(f"variant={name} sets {change}: omit {contrary}")
-    return compose(*(override for key, override in overrides_by_key.items() if key != "variant"), *changes)
+    return compose(*overrides, *changes, "variant=null")
 
 
 def compose_task(task: str, **overrides: Any) -> Node:
@@ -113,7 +114,15 @@ def offer_axes() -> None:
 
 @contextmanager
 def _hydra() -> Iterator[ConfigLoader]:
-    """Initialise Hydra with `CONF` and restore its global state afterwards, for programs that use Hydra themselves."""
+    """Initialise Hydra with `CONF` and restore its global state afterwards, for programs that use Hydra themselves.
+
+    Within a command, its own Hydra is used, which also finds the options in the folder of `--config-dir`.
+    """
+    if HydraConfig.initialized() and (command := GlobalHydra.instance().hydra):
+        main_folders = [each.path for each in command.config_loader.get_sources() if each.provider == "main"]
+        if main_folders == [str(CONF)]:
+            yield command.config_loader
+            return
     state = GlobalHydra.instance().hydra, VersionBase.instance().version_base
     GlobalHydra.instance().clear()
     offer_options()

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from vla.config.adopt import LAST_CHECKPOINT
 from vla.config.annotations import locate
 from vla.config.build import Group, build
 from vla.config.differences import IGNORED_KEYS
@@ -25,7 +26,7 @@ from vla.io.files import warn_on_error, writing
 from vla.io.printable import escape, show
 from vla.io.versions import installed_versions
 from vla.models.chunking import require_fit
-from vla.models.policy_folder import read_policy, require_unseen
+from vla.models.policy_folder import POLICY, read_policy, require_unseen
 from vla.policy import costs, torch_device
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.result_tables import conditions_table, plot_conditions, secondary_table
@@ -235,6 +236,7 @@ def require_possible(experiment: Experiment) -> None:
     output = Path(settings.output)  # not created yet
     if settings.job != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
         raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
+    _require_own(experiment, output)
     # Worlds take time to compile: one is built for all conditions that change the same arguments; nodes were checked.
     kinds = {frozenset(changes): (name, changes) for name, changes in reversed(options.changes.items())}
     for name, changes in kinds.values() if experiment.playable else ():
@@ -256,6 +258,16 @@ def _require_usable(experiment: Experiment) -> None:
         torch_device("cuda")
     if hasattr(kind, "require_exportable"):
         kind.require_exportable(experiment.kind("model"), experiment.kind("tokenizer"))
+
+
+def _require_own(experiment: Experiment, output: Path) -> None:
+    """Raise a UserError if the output folder has a training, and not its policy but another one, or an agent, acts."""
+    policy = experiment.checkpoint
+    acts_otherwise = policy is not None or experiment["agent"] is not None
+    if not acts_otherwise or (policy and policy.resolve().is_relative_to(output.resolve())):
+        return
+    if (output / LAST_CHECKPOINT).exists() or (output / POLICY).exists():
+        raise UserError(f"{output} has a training of its own, whose report this would replace: add output=DIR")
 
 
 def _require_distinct(condition: str, world: Any, options: Evaluation) -> None:

@@ -32,6 +32,8 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | N
     The first result is the checkpoint of an unfinished training, or None. The second is the folder of the policy that a
     finished training selected, or None; it needs no checkpoint. Both are None before the first save.
     """
+    if any(folder.glob(f"round_*/{CHECKPOINTS}")):
+        raise UserError(f"{folder} has the rounds of a job=improve: continue them by that job, or choose output=DIR")
     last, policy_folder = folder / CHECKPOINTS / LAST, folder / POLICY
     if last.exists():
         header = read_header(last)

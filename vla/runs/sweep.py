@@ -90,7 +90,7 @@ def save_failure(cell: Path, reason: str) -> None:
 
 def describe_failures(folder: Path) -> str:
     """Return the number of failed cells of a sweep, and a line for each."""
-    lines, count = failures(folder), len(cells(folder, OVERRIDES))
+    lines, count = failures(folder), len({*cells(folder, OVERRIDES), *cells(folder, FAILURE)})
     return "\n  ".join([f"{len(lines)} of {count} cells failed, see {FAILURE} of each in {folder}", *lines])
 
 
