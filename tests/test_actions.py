@@ -379,12 +379,14 @@ def test_a_topic_of_an_unknown_type_does_not_end_a_recording(
     [
         ({"command": FOLLOW}, "control_msgs/action/FollowJointTrajectory is not installed: apt install ros-jazzy-cont"),
         ({"gripper": GRIPPERS["franka"]}, "franka_msgs/action/Grasp is not installed: build franka_ros2, and source"),
+        ({}, "ROS 2 is not installed"),
     ],
 )
-def test_missing_messages_are_named_before_anything_else(
+def test_what_is_not_installed_is_named_before_anything_else(
     monkeypatch: pytest.MonkeyPatch, changed: dict[str, Any], says: str
 ) -> None:
-    for module in ("control_msgs", "franka_msgs"):
+    monkeypatch.setattr(RosNetwork, "apply", lambda network: None)
+    for module in ("rclpy", "control_msgs", "franka_msgs"):
         monkeypatch.setitem(sys.modules, module, None)
         monkeypatch.setitem(sys.modules, f"{module}.action", None)
 

@@ -13,8 +13,8 @@ import bags
 import composing
 import numpy as np
 import pytest
-from arm import ROBOT, SPEC
-from rosbags.rosbag2 import StoragePlugin
+from arm import ARM, ROBOT, SPEC
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from vla.config.build import build
 from vla.config.experiment import to_plain
@@ -25,6 +25,7 @@ from vla.deploy.settings import Topics
 from vla.io.errors import UserError
 from vla.spec import Episode
 
+UNSEEN_GRIPPER = replace(SPEC, robot=replace(ARM, gripper=None))
 TOPICS = Topics(dict(bags.IMAGES), "/joint_states", "/words", "/commands", None, None)
 
 
@@ -129,6 +130,9 @@ def test_without_rosbags_a_sentence_says_what_to_install(
         ),
         ({"topics": replace(TOPICS, commands="/words")}, "/words can be used: they are of type std_msgs/msg/Str"),
         ({"robot": replace(ROBOT, joints=[f"fr3_joint{n}" for n in range(1, 8)])}, "lacks fr3_joint1, .* has"),
+        ({"robot": replace(ROBOT, joints=ROBOT.joints[::-1])}, r"panda_joint1 where expert\.robot\.joints has"),
+        ({"robot": replace(ROBOT, fingers=[])}, r"name the joints in expert\.robot\.fingers"),
+        ({"robot": replace(ROBOT, fingers=[]), "spec": UNSEEN_GRIPPER}, r"moves a gripper: .* expert\.robot\.fingers"),
         ({"spec": replace(SPEC, robot=None)}, "expert=bag needs a robot"),
         ({"spec": replace(SPEC, cameras=("top",))}, r"no topic for cameras top: add \+expert\.topics"),
     ],
@@ -161,6 +165,17 @@ def test_an_empty_instruction_ends_nothing_where_a_status_tells_what_goes_on(tmp
     )
     episodes = episodes_of(imported(bags.write(tmp_path / "bag", parts)))
     assert [episode.instruction for episode in episodes] == ["lift it"] * 2
+
+
+def test_the_agents_of_two_arms_are_not_mistaken_for_each_other(tmp_path: Path) -> None:
+    status = {"level": 0, "name": "", "message": "", "hardware_id": "", "values": []}
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        session = bags.Session(writer, status=True, compressed=False)
+        session.send("/left/vla_agent/status", bags.make("diagnostic_msgs/msg/DiagnosticStatus", **status))
+        for part in bags.SESSION[:3]:
+            session.play(part)
+    with pytest.raises(UserError, match="several agents, /left/vla_agent/status, /vla_agent/status: record each"):
+        imported(tmp_path / "bag")
 
 
 def test_joint_states_count_when_they_were_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

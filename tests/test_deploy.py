@@ -36,7 +36,7 @@ from vla.data.episodes import EpisodeStore
 from vla.deploy import say
 from vla.deploy.loop import Loop
 from vla.deploy.messages import SimulatedEpisode
-from vla.deploy.operator import DemoOperator
+from vla.deploy.operator import DemoOperator, Operator, require_alone
 from vla.deploy.ros import RosNetwork, split_arguments
 from vla.io.errors import UserError
 from vla.jobs import deploy as job
@@ -232,6 +232,8 @@ def test_an_episode_that_breaks_off_is_an_error_of_the_loop(tmp_path: Path, monk
     [
         ("deploy.agent.topics.commands=/other", r"deploy\.agent\.topics and deploy\.simulator\.topics differ"),
         ("deploy.simulator.network.domain=7", r"deploy\.agent\.network and deploy\.simulator\.network differ"),
+        ("deploy/robot@deploy.agent.robot=fr3", r"deploy\.agent\.robot\.joints and deploy\.simulator\.robot\.joints"),
+        ("deploy.agent.autostart=false", r"from an agent with deploy\.agent\.autostart"),
         ("deploy.simulator.seed=999999", "seed=999999: seeds below 1000000 are for demonstrations: raise it"),
     ],
 )
@@ -248,6 +250,34 @@ def test_a_loop_that_is_interrupted_before_an_episode_is_over_leaves_no_report(
     monkeypatch.setattr(Loop, "running", lambda loop: nullcontext(operator))
     job.run(loop_of(tmp_path))
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("name", ["vla_agent", "vla_simulator", "vla_operator"])
+def test_a_loop_does_not_start_beside_nodes_that_it_would_take_for_its_own(name: str) -> None:
+    names = ["vla_operator", "vla_say", name]
+    node = SimpleNamespace(get_name=lambda: "vla_operator", get_node_names=lambda: names)
+    with pytest.raises(UserError, match=f"{name} of another command is on the same network and domain"):
+        require_alone(node)
+    names.pop()
+    require_alone(node)
+
+
+def test_without_a_simulator_to_reset_the_agent_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def create_client(kind: Any, service: str) -> Any:
+        called.append(service)
+        return SimpleNamespace(service_is_ready=lambda: "simulator" not in service)
+
+    def wait(operator: Operator, condition: Callable[[], bool], description: str) -> None:
+        if not condition():
+            raise UserError(f"timed out, waiting for {description}")
+
+    called: list[str] = []
+    monkeypatch.setattr(Operator, "wait", wait)
+    operator = Operator.__new__(Operator)
+    operator.node = SimpleNamespace(create_client=create_client, destroy_client=lambda client: None)
+    with pytest.raises(UserError, match="waiting for the service /vla_simulator/reset"):
+        operator.next_episode()
+    assert called == ["/vla_simulator/reset"]
 
 
 def learn_from_the_bag(home: Path) -> None:

@@ -274,7 +274,7 @@ def test_wrong_requests_of_the_lifecycle_are_refused_and_survived(world: World) 
     assert world.change(Transition.TRANSITION_CLEANUP)
     assert world.ask(GetState, "get_state", GetState.Request()).current_state.label == "unconfigured"
     world.start()
-    assert world.state is State.RUNNING
+    assert world.becomes(State.RUNNING)
 
 
 def test_deactivation_brakes_first(world: World) -> None:

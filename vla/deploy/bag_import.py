@@ -94,7 +94,10 @@ class _Bag:
         self._used, self._problems = set[str](), dict[str, str]()  # topics; topic → why its first message is unusable
         with open_bag(folder) as reader:
             self.kinds = {connection.topic: connection.msgtype for connection in reader.connections}
-            status = next((topic for topic in self.kinds if topic.endswith(STATUS)), None)
+            statuses = [topic for topic in self.kinds if topic.endswith(STATUS)]
+            if len(statuses) > 1:
+                raise UserError(f"{folder} has several agents, {', '.join(statuses)}: record each in a bag of its own")
+            status = statuses[0] if statuses else None
             self._has_status = status is not None
             self._person = None if status else True  # whether a person moves the arm, or the policy; None: neither
             handlers: dict[str | None, Callable[[float, Any], None]] = {
@@ -227,9 +230,12 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         if len(robot.joints) != len(model.joints):
             counts = f"the task's robot has {len(model.joints)} joints, expert.robot has {len(robot.joints)}"
             raise UserError(f"{counts}: choose another one with deploy/robot@expert.robot=OPTION")
+        robot.require(model, "the task", "expert.robot")
         if missing := [camera for camera in spec.cameras if camera not in topics.images]:
             raise UserError(f"no topic for cameras {', '.join(missing)}: add +expert.topics.images.{missing[0]}=TOPIC")
         self._controller, self._gripper = recorded_controller(spec), gripper_index(spec)
+        if self._gripper is not None and not robot.fingers:
+            raise UserError("the task moves a gripper: name its joints in expert.robot.fingers")
         self._cameras = {topics.images[camera]: camera for camera in spec.cameras}  # topic → camera
         bags = _read_bags(folder, topics, robot)
         for bag in bags:

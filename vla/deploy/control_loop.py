@@ -23,6 +23,7 @@ RESTART = "deactivate and activate the agent, or start it again"
 HAND_BACK = "python -m vla.deploy.say --hand-back, or call ~/hand_over with false"
 REPETITION_TIME = 2.0  # an equal instruction within this time is a repetition, as `ros2 topic pub` sends them [s]
 REST_MOTION, REST_TIME = 0.005, 0.2  # an arm that has moved less [rad] for so long [s] is at rest
+JUMP = 0.1  # largest motion between two joint states beyond what the speed of the joint explains [rad]
 
 
 @dataclass
@@ -230,7 +231,8 @@ class ControlLoop:
         if joint_state is None:
             return
         if not self.motion.started and self.state is not State.FAULT:  # after which a person must inspect the arm
-            if problem := self._joints_problem(now):  # the arm may be elsewhere by now
+            # The arm may be elsewhere by now, or one of two sources of joint states may not have been heard yet.
+            if problem := self._joints_problem(now) or self._history_problem():
                 return None if self.state is State.STOPPED else self._set_state(self.state, problem)
             self._take_over(joint_state, now)
         off_track, moved_unseen = self._tracking.check(self.motion, joint_state, now)
@@ -279,10 +281,17 @@ class ControlLoop:
         return ""
 
     def _joints_problem(self, now: float) -> str:
-        """Say that the newest joint state is too old, or that there is none; empty if it is recent."""
+        """Say that the newest joint state is too old, or that there is none, or that joint states jump; else ""."""
         joint_state = self.observer.newest_joint_state
-        is_recent = joint_state is not None and now - joint_state.stamp <= self.safety.joints_age
-        return "" if is_recent else f"no joint state within the last {self.safety.joints_age} s"
+        if joint_state is None or now - joint_state.stamp > self.safety.joints_age:
+            return f"no joint state within the last {self.safety.joints_age} s"
+        if self.observer.jump(REST_TIME, np.array(self.limits.speed)) > JUMP:
+            return "the joint states jump: does another node publish on the topic deploy.topics.joint_states, too?"
+        return ""
+
+    def _history_problem(self) -> str:
+        """Say that joint states have not come for long enough to tell whether they agree; else ""."""
+        return "" if self.observer.duration >= REST_TIME else f"less than {REST_TIME} s of joint states"
 
     def _set_state(self, state: State, reason: str) -> None:
         if state is not self.state:

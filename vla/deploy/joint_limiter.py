@@ -13,7 +13,7 @@ import numpy as np
 from annotated_types import Gt, Le, MinLen
 
 from vla.io.errors import UserError
-from vla.io.types import NonNegative, Positive, Text
+from vla.io.types import NonNegative, Positive, Text, unique
 from vla.spec import Array, RobotModel
 
 PositiveShare = Annotated[float, Gt(0), Le(1)]
@@ -23,8 +23,8 @@ REST = 1e-9  # lower speeds are rounding errors [rad/s]
 
 @dataclass(frozen=True)
 class JointLimits:
-    """Names and limits of the joints of an arm and its gripper. Raises a UserError if lists have different lengths, or
-    the lowest position of a joint, with the margin, is not below the highest.
+    """Names and limits of the joints of an arm and its gripper. Raises a UserError if lists have different lengths, a
+    joint is named twice, or the lowest position of a joint, with the margin, is not below the highest.
 
     Attributes:
         joints: J names, base to tip.
@@ -55,11 +55,13 @@ class JointLimits:
             raise UserError(
                 "deploy.robot needs one entry per joint in each of joints, low, high, speed and acceleration"
             )
+        if not unique([*self.joints, *self.fingers]):
+            raise UserError("deploy.robot names a joint twice among its joints and fingers")
         if not (self.min_position < self.max_position).all():
             raise UserError("deploy.robot.low must be below high by more than twice the margin, for every joint")
 
-    def require(self, model: RobotModel, owner: str) -> None:
-        """Raise a UserError unless an arm of these limits can be that of `owner`, a policy or a task."""
+    def require(self, model: RobotModel, owner: str, key: str = "deploy.robot") -> None:
+        """Raise a UserError unless an arm of these limits, at `key`, can be that of `owner`, a policy or a task."""
         if len(self.joints) != len(model.joints):
             raise UserError(
                 f"{owner} has {len(model.joints)} joints, the robot {len(self.joints)}: use another deploy/robot"
@@ -67,11 +69,11 @@ class JointLimits:
         for name, robot_name in zip(model.joints, self.joints, strict=True):
             if name != robot_name and name in self.joints:
                 raise UserError(
-                    f"{owner} has {name} where deploy.robot.joints has {robot_name}: list joints and limits of the "
+                    f"{owner} has {name} where {key}.joints has {robot_name}: list joints and limits of the "
                     f"robot in {owner}'s order, {', '.join(model.joints)}"
                 )
         if model.gripper and not self.fingers:
-            raise UserError(f"{owner} sees how far its gripper is open: name the joints in deploy.robot.fingers")
+            raise UserError(f"{owner} sees how far its gripper is open: name the joints in {key}.fingers")
 
     @cached_property
     def min_position(self) -> Array:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
+from multiprocessing.process import BaseProcess
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -74,12 +76,13 @@ class Loop:
         """Start both nodes and the recorder; yields the operator."""
         arguments = {"policy": self.policy, "environment": self.environment, "output": self.output}
         agent, simulator = self.agent(**arguments), self.simulator(**arguments)
-        if agent.command != "joint_state" or agent.dry_run:
+        if agent.command != "joint_state" or agent.dry_run or not agent.autostart:
             raise UserError(
-                "deploy=loop: the simulator obeys deploy.agent.command=joint_state only, without deploy.agent.dry_run"
+                "deploy=loop: the simulator obeys deploy.agent.command=joint_state only, without deploy.agent.dry_run, "
+                "from an agent with deploy.agent.autostart"
             )
-        for name in ("topics", "network"):
-            if getattr(agent, name) != getattr(simulator, name):
+        for name in ("topics", "network", "robot.joints", "robot.fingers", "robot.finger_travel"):
+            if attrgetter(name)(agent) != attrgetter(name)(simulator):
                 raise UserError(
                     f"deploy=loop: agent and simulator would not hear each other, because deploy.agent.{name} and "
                     f"deploy.simulator.{name} differ: change both alike"
@@ -88,26 +91,29 @@ class Loop:
         processes = [
             context.Process(target=_run, args=(node, ros_arguments), daemon=True) for node in (agent, simulator)
         ]
-        for process in processes:
-            process.start()
-        try:
-            with ros(agent.network, self.output) as stop_event, ExitStack() as stack:
-                from rclpy import create_node
+        with ros(agent.network, self.output) as stop_event, ExitStack() as stack:
+            from rclpy import create_node
 
-                from vla.deploy.operator import DemoOperator
+            from vla.deploy.operator import DemoOperator, require_alone
 
-                node = create_node("vla_operator")
-                stack.callback(node.destroy_node)
-                operator = DemoOperator(node, agent.topics.instruction, stop_event, *processes)
-                # Recorded to the end, because a failed episode is the one to inspect.
-                stack.enter_context(closing(BagRecorder(node, self.output / "bag")))
-                yield operator
-        finally:
+            node = create_node("vla_operator")
+            stack.callback(node.destroy_node)
+            require_alone(node)
             for process in processes:
-                process.terminate()
-            for process in processes:
-                process.join(timeout=5.0)
-                process.kill()
+                process.start()
+            stack.callback(_end, processes)
+            operator = DemoOperator(node, agent.topics.instruction, stop_event, *processes)
+            # Recorded to the end, because a failed episode is the one to inspect.
+            stack.enter_context(closing(BagRecorder(node, self.output / "bag")))
+            yield operator
+
+
+def _end(processes: Sequence[BaseProcess]) -> None:
+    for process in processes:
+        process.terminate()
+    for process in processes:
+        process.join(timeout=5.0)
+        process.kill()
 
 
 def _run(node: PolicyDeployment | SimulatorDeployment, arguments: list[str]) -> None:

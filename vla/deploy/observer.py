@@ -96,12 +96,26 @@ class Observer:
             return f"the images of {', '.join(self._spec.cameras)} are more than {MAX_SKEW} s apart"
         return ""
 
+    @property
+    def duration(self) -> float:
+        """Time from the oldest joint state in the history to the newest [s]."""
+        return self._joint_states[-1].stamp - self._joint_states[0].stamp if self._joint_states else 0.0
+
     def displacement(self, seconds: float) -> float:
         """Return how far a joint has moved within the last `seconds` of the history [rad]."""
-        positions = [
-            state.joints for state in self._joint_states if state.stamp >= self._joint_states[-1].stamp - seconds
-        ]
+        positions = [state.joints for state in self._recent(seconds)]
         return float(np.ptp(positions, axis=0).max()) if positions else 0.0
+
+    def jump(self, seconds: float, speed: Array) -> float:
+        """Return how much farther a joint has moved between two joint states of the last `seconds` than `speed` (J,)
+        allows [rad]."""
+        states = self._recent(seconds)
+        times, joints = np.array([state.stamp for state in states]), np.array([state.joints for state in states])
+        allowed = np.abs(np.diff(times))[:, None] * speed
+        return float((np.abs(np.diff(joints, axis=0)) - allowed).max(initial=0.0))
+
+    def _recent(self, seconds: float) -> list[JointMeasurement]:
+        return [state for state in self._joint_states if state.stamp >= self._joint_states[-1].stamp - seconds]
 
     def new_image_time(self, previous: float, earliest: float) -> float | None:
         """Return when the newest images were taken; None unless they match, after `previous`, from about `earliest`."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from threading import Event
 from typing import Any
@@ -28,7 +29,7 @@ log = logging.getLogger(__name__)
 
 TIMEOUT = 10.0  # of the discovery of a subscriber or service, of a service call, and of a status [s]
 SETTLING_TIME = 0.7  # discovery is complete after so long without a new subscriber [s]
-START = 60.0  # longest start of both nodes of the demo [s]
+START = 600.0  # longest start of both nodes of the demo, with a large policy that is compiled or exported [s]
 AGENT, SIMULATOR = "/vla_agent", "/vla_simulator"
 
 
@@ -66,16 +67,22 @@ class Operator:
                 )
             rclpy.spin_once(self.node, timeout_sec=0.02)
 
-    def call(self, kind: Any, service: str, request: Any) -> Any:
-        """Call a service and return its answer."""
+    @contextmanager
+    def client(self, kind: Any, service: str) -> Iterator[Any]:
+        """Yield a client of a service once that is there."""
         client = self.node.create_client(kind, service)
         try:
             self.wait(client.service_is_ready, f"the service {service}")
+            yield client
+        finally:
+            self.node.destroy_client(client)
+
+    def call(self, kind: Any, service: str, request: Any) -> Any:
+        """Call a service and return its answer."""
+        with self.client(kind, service) as client:
             answer = client.call_async(request)
             self.wait(answer.done, f"an answer of {service}")
             return answer.result()
-        finally:
-            self.node.destroy_client(client)
 
     def say(self, instruction: str) -> None:
         """Publish an instruction once all subscribers are discovered, and wait until they confirm it."""
@@ -111,6 +118,9 @@ class Operator:
 
         The agent then waits for an instruction. Returns the simulator's description of the episode; "" without `reset`.
         """
+        if reset:
+            with self.client(Trigger, f"{SIMULATOR}/reset"):
+                pass  # without a simulator the agent goes on
         client = self.node.create_client(ChangeState, f"{AGENT}/change_state")
         has_agent = client.wait_for_service(SETTLING_TIME)
         self.node.destroy_client(client)
@@ -130,14 +140,15 @@ class Operator:
 
 
 class DemoOperator(Operator):
-    """Plays the episodes of the closed-loop demo; `stopped` is set on interruption."""
+    """Plays the episodes of the closed-loop demo; `stopped` is set on interruption, also while the nodes start."""
 
     def __init__(self, node: Any, topic: str, stopped: Event, agent: BaseProcess, simulator: BaseProcess) -> None:
         super().__init__(node, topic, (agent, simulator))
         self.stopped = stopped
         node.create_subscription(String, f"{SIMULATOR}/episode", self._on_episode, LATCHED_QOS)
         self._episode: SimulatedEpisode | None = None
-        self.wait(lambda: self._words.get_subscription_count() >= 2, "both nodes to subscribe", START)
+        subscribers = self._words.get_subscription_count
+        self.wait(lambda: subscribers() >= 2 or self.stopped.is_set(), "both nodes to subscribe", START)
 
     def play(self) -> Result | None:
         """Play one episode, after the last has ended; return None if it was interrupted."""
@@ -165,6 +176,18 @@ class DemoOperator(Operator):
             self._episode = SimulatedEpisode.from_message(message)
         except UserError as error:  # anybody on the network can send one
             log.warning("dropped a message: %s", error)
+
+
+def require_alone(node: Any) -> None:
+    """Raise a UserError if there is an agent, a simulator or another demo where `node` is, the operator of a demo."""
+    time.sleep(SETTLING_TIME)  # until all are discovered
+    names = node.get_node_names()
+    limits = {AGENT.strip("/"): 0, SIMULATOR.strip("/"): 0, node.get_name(): 1}
+    if others := [name for name, limit in limits.items() if names.count(name) > limit]:
+        raise UserError(
+            f"deploy=loop: {', '.join(others)} of another command is on the same network and domain: end that first, "
+            "or set the environment variable ROS_DOMAIN_ID to another number"
+        )
 
 
 def _require(answer: Any) -> None:

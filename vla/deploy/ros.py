@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from threading import Event
 from typing import Annotated, Any, Literal
@@ -68,6 +69,20 @@ class RosNetwork:
             os.environ["ROS_DOMAIN_ID"] = str(self.domain)
 
 
+def require_ros(network: RosNetwork) -> None:
+    """Import ROS for a network; raise a UserError if it is not installed, or would not accept the network."""
+    network.apply()
+    # dm_control enables DeprecationWarnings; users cannot fix those of other packages.
+    warnings.filterwarnings("ignore", category=DeprecationWarning, module="lark")
+    try:
+        import_module("rclpy")
+    except ImportError as error:
+        raise UserError(
+            "ROS 2 is not installed: install vla[ros] (Linux, x86-64), or source the setup.bash of a ROS 2 Jazzy for "
+            f"this version of Python ({error})"
+        ) from error
+
+
 @contextmanager
 def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
     """Run ROS; yields an event that SIGINT, SIGTERM and a hang-up of the terminal set.
@@ -78,19 +93,12 @@ def ros(network: RosNetwork, log_folder: Path | None = None) -> Iterator[Event]:
         UserError: rclpy cannot be imported.
         UserError: ROS does not accept this network or these arguments.
     """
-    network.apply()
-    # dm_control enables DeprecationWarnings; users cannot fix those of other packages.
-    warnings.filterwarnings("ignore", category=DeprecationWarning, module="lark")
+    require_ros(network)
     if log_folder is not None:
         os.environ.setdefault("ROS_LOG_DIR", str(log_folder))
-    try:
-        import rclpy
-        from rclpy.signals import SignalHandlerOptions
-    except ImportError as error:
-        raise UserError(
-            "ROS 2 is not installed: install vla[ros] (Linux, x86-64), or source the setup.bash of a ROS 2 Jazzy for "
-            f"this version of Python ({error})"
-        ) from error
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
     hangup = () if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (signal.SIGHUP,)  # ignored by nohup
     with signal_event(signal.SIGINT, signal.SIGTERM, *hangup) as stop_event:
         try:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from vla.deploy.ros import ros, spin
+from vla.deploy.ros import require_ros, ros, spin
 from vla.deploy.settings import FOLLOW, PolicySettings, SimulatorSettings, action_class
 from vla.io.errors import UserError
 
@@ -21,6 +21,7 @@ class PolicyDeployment(PolicySettings):
             action_class("control_msgs", "FollowJointTrajectory")
         if self.gripper is not None:
             self.gripper.goals("gripper")
+        require_ros(self.network)  # before a large policy is loaded
         policy = self.policy()
         with ros(self.network, self.output) as stop_event:
             from vla.deploy.lifecycle_node import SUCCESS

@@ -87,15 +87,26 @@ class PolicyServer:
 
     def run(self) -> None:
         """Serve until interrupted; raise a UserError if the policy or the address cannot be served."""
+        with self._address_errors():  # before a large policy is loaded, and perhaps compiled
+            asyncio.run(_bind(self.host, self.port))
         policy = self.policy()
         if not hasattr(policy, "lanes"):  # an agent in its place
             raise UserError(
                 f"deploy=server serves a trained policy, checkpoint=RUN; a {type(policy).__name__} cannot be served"
             )
+        with (
+            self._address_errors(),
+            signal_event(signal.SIGINT, signal.SIGTERM) as stop,
+            Service(self, policy).serve_in_thread() as url,
+        ):
+            log.info("serving the policy at %s", url)
+            stop.wait()
+
+    @contextmanager
+    def _address_errors(self) -> Iterator[None]:
+        """Convert an OSError into a UserError that names the address."""
         try:
-            with signal_event(signal.SIGINT, signal.SIGTERM) as stop, Service(self, policy).serve_in_thread() as url:
-                log.info("serving the policy at %s", url)
-                stop.wait()
+            yield
         except OSError as error:
             address = f"deploy.host={self.host} deploy.port={self.port}"
             raise UserError(f"cannot listen at {address}: {error.strerror}; deploy.port=0 is any free one") from error
@@ -251,6 +262,12 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
         "chunking": policy.chunking is not None,
         "reset": True,
     }
+
+
+async def _bind(host: str, port: int) -> None:
+    """Listen at an address and stop at once; raise an OSError if that is not possible."""
+    server = await asyncio.get_running_loop().create_server(asyncio.Protocol, host, port)
+    server.close()
 
 
 def _is_loopback(host: str) -> bool:
