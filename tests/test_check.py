@@ -14,10 +14,13 @@ from omegaconf import DictConfig, OmegaConf
 from saved_policies import save_policy
 
 from vla import jobs
+from vla.config import packages
 from vla.config.adopt import adopt
 from vla.config.build import build
-from vla.config.experiment import Experiment, to_plain
+from vla.config.experiment import Experiment, _without_weights, to_plain
 from vla.config.resolvers import digest
+from vla.io.types import Inherited
+from vla.models.model import TokenModel
 from vla.models.policy_folder import require_unseen
 
 GRAMMAR = {
@@ -32,6 +35,12 @@ SHAPES = {"_target_": "vla.tasks.tabletop.randomize.blocks.Shapes"}
 MASSES = {"_target_": "vla.tasks.tabletop.randomize.blocks.Masses", "factor": [0.5, 2.0]}
 WAYPOINT = {"_target_": "vla.tasks.tabletop.expert.Waypoint", "_partial_": True}
 PERTURBED = {"_target_": "vla.tasks.perturb.Perturbed", "expert": WAYPOINT}
+
+
+class Own(TokenModel):
+    """A model of a package, whose weights are in a file, if there is one."""
+
+    def __init__(self, pretrained: str | None, backbone: object, **inherited: Inherited) -> None: ...
 
 
 def config(**changes: Any) -> DictConfig:
@@ -429,3 +438,12 @@ def test_a_checkpoint_may_be_evaluated_on_all_that_did_not_select_it(tmp_path: P
         require_unseen(path, "evaluate.seed", range(1_000_000, 2_000_000))
         require_unseen(path, "evaluate.seed", range(2_000_020, 2_000_040))
     check(config(job="evaluate", checkpoint=str(path), **{"validate.seed": 1_000_000}))  # nothing is validated
+
+
+def test_the_classes_of_a_saved_policy_are_built_without_pretrained_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(packages.TRUSTED, __name__)
+    backbone = {"_target_": "vla.models.vision.timm_encoders.FilmBackbone", "pretrained": "auto"}
+    node = {"_target_": f"{__name__}.Own", "pretrained": "weights.pt", "backbone": backbone}
+    assert _without_weights(node) == {**node, "pretrained": None, "backbone": {**backbone, "pretrained": False}}
+    vla = {"_target_": "vla.models.vlm.policy.VisionLanguageAction", "trunk": "hub:owner/name"}
+    assert _without_weights(vla) == {**vla, "trunk": None}

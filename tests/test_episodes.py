@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,6 +40,15 @@ def test_what_was_stored_is_read_back(tmp_path: Path) -> None:
                 one, other = getattr(seen, kind), getattr(was, kind)
                 assert one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in other)
             np.testing.assert_array_equal(seen.state, was.state)
+
+
+def test_a_world_may_describe_its_steps_in_lists_and_arrays(tmp_path: Path) -> None:
+    written = add(tmp_path, EPISODES)
+    sequences: dict[str, Any] = {"cameras": [*ARM_SPEC.cameras], "image_size": [*ARM_SPEC.image_size]}
+    spec = replace(ARM_SPEC, **sequences, low=np.array(ARM_SPEC.low))  # type: ignore[arg-type]
+    assert EpisodeStore.create_or_open(tmp_path, spec, CONFIG).spec == written.spec
+    with pytest.raises(ValueError, match=r"^this task has control_hz = 5\.0, but the episode store .* has 10\.0"):
+        EpisodeStore.create_or_open(tmp_path, replace(spec, control_hz=5.0), CONFIG)
 
 
 def test_the_files_can_be_read_without_this_package(tmp_path: Path) -> None:

@@ -96,6 +96,12 @@ def of_ten(**won: int) -> tuple[Result, ...]:
     return tuple(Result(FIRST_SEED + n, outcome, task=task) for n, (task, outcome) in enumerate(outcomes))
 
 
+def test_tiers_that_no_report_could_show_are_refused_before_any_work(tmp_path: Path) -> None:
+    asked = composed(f"output={tmp_path}", "agent=expert", "+task.tiers=[easy]")
+    with pytest.raises(ValueError, match=r"^config\.task\.tiers must be an object, got \['easy'\]"):
+        require_possible(Experiment.from_config(asked))
+
+
 def test_tiers_weigh_the_same_whatever_the_number_of_their_tasks() -> None:
     tiers = {"easy": ["reach", "push"], "very_hard": ["stack"], "unseen": ["fold"]}
     results = of_ten(reach=10, push=8, stack=2)

@@ -42,6 +42,8 @@ def test_without_loss_batches_episodes_and_index_are_those_of_a_raw_store(tmp_pa
     raw, small = add(tmp_path / "raw", EPISODES), add(tmp_path / "small", EPISODES, LOSSLESS)
     assert small.attempts == raw.attempts and digest_of(small.episodes) == digest_of(raw.episodes)
     assert content(small.folder)["index.jsonl"] == content(raw.folder)["index.jsonl"]
+    for place in (0, -1, slice(2, 4)):
+        np.testing.assert_array_equal(small.rows("rgb_front")[place], raw.rows("rgb_front")[place])
     rows = np.random.default_rng(0).permutation(len(raw.rows("action")))
     nearest = [NearestDemonstration(store.folder, None, spec=ARM_SPEC) for store in (raw, small)]
     np.testing.assert_array_equal(nearest[0]._images, nearest[1]._images)

@@ -15,6 +15,7 @@ import pytest
 from absl.testing import absltest
 from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from toy import ToyEnvironment
@@ -55,6 +56,39 @@ def test_images_are_contiguous_though_a_world_mirrors_its_own() -> None:
 
     seen = GymEnvironment(Mirrored()).reset(seed=3)[0], DmEnvironment(Mirrored()).reset(3).observation
     assert all(each["eye"].flags.c_contiguous for each in seen)
+
+
+def test_an_observation_stays_what_it_was_when_a_world_reuses_its_arrays() -> None:
+    class Reusing(ToyEnvironment):
+        kept: Observation | None = None
+
+        def _look(self) -> Observation:
+            seen = super()._look()
+            self.kept = self.kept or seen
+            self.kept.rgb["eye"][:], self.kept.state[:] = seen.rgb["eye"], seen.state
+            return self.kept
+
+    action = np.full(3, 0.05, np.float32)
+    environment, adapted = GymEnvironment(Reusing()), DmEnvironment(Reusing())
+    gym_steps = environment.reset(seed=3)[0], environment.step(action)[0]
+    dm_steps = adapted.reset(3).observation, adapted.step(action).observation
+    for first, second in (gym_steps, dm_steps):
+        assert not np.array_equal(first["state"], second["state"]) and not np.array_equal(first["eye"], second["eye"])
+
+
+def test_worlds_in_processes_give_instructions_or_an_error() -> None:
+    makers = [lambda: GymEnvironment(ToyEnvironment())] * 2
+    with pytest.raises(ValueError, match="shared_memory=False"):
+        AsyncVectorEnv(makers)
+    environment = AsyncVectorEnv(makers, shared_memory=False)
+    observation, _ = environment.reset(seed=[3, 4])
+    assert all(text.startswith("go to the ") for text in observation["instruction"])
+    environment.close()
+
+
+def test_a_mode_that_draws_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^render_mode='human' is none of the modes"):
+        GymEnvironment(ToyEnvironment(), "human")
 
 
 @pytest.fixture(scope="module")

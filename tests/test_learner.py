@@ -15,7 +15,9 @@ from defaults import defaults_of
 from fake_batch import make_act, make_batch, make_bc, make_decoder, make_rt1, with_text
 from small_training import fit, loader, make_learner, make_trainer
 
-from vla.models.model import Model
+from vla.models.bc import BC
+from vla.models.layers import Batch
+from vla.models.model import Model, Prediction
 from vla.models.text.ngrams import NGrams
 from vla.models.vision.timm_encoders import FilmBackbone, FilmEfficientNet
 from vla.training.checkpoints import AtomicCheckpointIO
@@ -42,6 +44,18 @@ def test_the_error_of_a_component_is_the_mean_distance_over_what_is_valid() -> N
     logits = model(with_text(model, batch))["logits"]
     error = (model.tokenizer.decode_logits(logits) - batch["action"]).abs()[1:, ..., 0].mean() * 1000
     assert metrics["val/error_x_mm"] == pytest.approx(error.item(), rel=1e-4)
+
+
+def test_validation_shows_a_model_no_more_than_a_policy_does() -> None:
+    class Peeking(BC):
+        def predict(self, batch: Batch) -> Prediction:
+            return Prediction(batch["action"][:, -1])
+
+    model = make_bc()
+    model.__class__ = Peeking
+    learner = make_learner(model).eval()
+    with pytest.raises(KeyError, match="action"):
+        make_trainer(1).validate(learner, loader(learner, [make_batch(1)]), verbose=False)
 
 
 @pytest.mark.parametrize("model", [make_bc(), make_rt1(), make_decoder()], ids=["bc", "rt1", "decoder"])

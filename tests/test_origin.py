@@ -12,6 +12,7 @@ from composing import composed
 from vla.config import origin
 from vla.config.experiment import Experiment
 from vla.config.origin import find_origin
+from vla.io import versions
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -83,3 +84,10 @@ def test_settings_that_only_the_class_of_the_default_has_are_no_differences() ->
         for each in Experiment.from_config(composed("model/image=film_efficientnet"), composed()).changes
     }
     assert "model.image._target_" in changes and "-" not in [each["here"] for each in changes.values()]
+
+
+def test_the_package_of_a_world_is_among_the_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = SimpleNamespace(name="gym-world", requires=["gymnasium>=1", "pygame"])
+    monkeypatch.setattr(versions, "distributions", lambda: [world])
+    monkeypatch.setattr(versions, "version", lambda name: "2.3")
+    assert versions.installed_versions.__wrapped__() == {"gym-world": "2.3"}

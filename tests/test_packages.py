@@ -122,6 +122,22 @@ def test_a_package_without_its_folder_of_options_is_named(
     assert len(said.splitlines()) == 1
 
 
+@pytest.mark.parametrize(("option", "hiding"), [("model/bc.yaml", "vla"), ("model/theirs.yaml", "first_package")])
+def test_an_option_that_another_one_would_hide_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str, hiding: str
+) -> None:
+    names = ("first_package", "second_package")
+    for name, file in zip(names, ("model/theirs.yaml", option), strict=True):
+        (tmp_path / name / "conf/model").mkdir(parents=True)
+        (tmp_path / name / "conf" / file).touch()
+    entries = [EntryPoint(name, f"{name}.conf", packages.ENTRY_POINTS) for name in names]
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(packages, "entry_points", lambda group: entries)
+    words = f"^the installed packages {hiding} and second_package both have the option {option}"
+    with pytest.raises(ValueError, match=words):
+        packages.option_folders.__wrapped__()
+
+
 def test_a_job_with_a_group_of_its_own_is_two_options_and_a_module(home: Path, importable: None) -> None:
     asked = ("job=survey", "task=mine", "survey.episodes=3")
     world = import_module("mypackage.world").Square(16, 30)

@@ -244,3 +244,14 @@ def test_observations_of_another_kind_are_refused(rgb: dict[str, np.ndarray]) ->
         policy.act(replace(observations(1)[0], rgb=rgb))
     with pytest.raises(ValueError, match="east"):
         policy.act(replace(observations(1)[0], state=np.zeros(3, np.float32)))
+
+
+def test_lanes_take_mappings_whose_numbers_are_lists_and_whose_instruction_is_an_array() -> None:
+    policy, seen = as_policy(make_bc(), lanes=2), observations(1)[0]
+    mapping = {**seen.rgb, "state": seen.state, "instruction": seen.instruction}
+    other = {**mapping, "state": seen.state.tolist(), "instruction": np.array(seen.instruction, dtype=object)}
+    expected = policy.act([seen, seen], [0, 1])
+    np.testing.assert_array_equal(policy.act([mapping, other], [0, 1]), expected)
+    for wrong in (None, ["one", "two"]):
+        with pytest.raises(ValueError, match=r"^the observation's instruction must be a text, got "):
+            policy.act({**mapping, "instruction": wrong})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import pickle
 import signal
 from collections.abc import Callable
 from functools import partial
@@ -223,6 +224,15 @@ class Partial(toy.ToyExpert):
 
     def act(self, observation: Observation) -> Array:
         return super().act(observation) * (self._left >= 0)
+
+
+def test_a_model_that_cannot_be_sent_to_a_worker_is_found_before_training(tmp_path: Path) -> None:
+    model, trainer = make_bc(), SimpleNamespace(enable_validation=True)
+    played = ClosedLoop(toy.make_environment, lambda model: toy.ToyExpert(), range(10), tmp_path, workers=2)
+    played.on_fit_start(trainer, make_learner(model))  # type: ignore[arg-type]
+    model.activation = lambda values: values  # type: ignore[assignment]
+    with pytest.raises((AttributeError, pickle.PicklingError), match="lambda"):
+        played.on_fit_start(trainer, make_learner(model))  # type: ignore[arg-type]
 
 
 def test_the_best_weights_are_chosen_if_the_last_ones_are_clearly_worse(folder: Path, tmp_path: Path) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from fake_batch import as_policy, make_act, make_bc, make_denoising, make_rt1
 from toy import Telling, ToyEnvironment, ToyExpert, ToyInTurn
 
@@ -102,3 +104,21 @@ def test_an_evaluation_in_lanes_reports_the_same() -> None:
     seeds = range(FIRST_SEED, FIRST_SEED + 7)
     reports = [evaluate(Telling, lambda world: policy, None, seeds, lanes=lanes) for lanes in (1, 2, 3)]
     assert reports[0] == reports[1] == reports[2] and not reports[0].errors
+
+
+def test_a_world_may_reuse_its_arrays_and_have_those_of_another_library() -> None:
+    class Reusing(ToyEnvironment):
+        tool = np.zeros(3)
+
+        def _look(self) -> Observation:
+            seen = super()._look()
+            self.tool[:2] = self._point
+            images: dict[str, Any] = {name: torch.from_numpy(image) for name, image in seen.rgb.items()}
+            return replace(seen, rgb=images, state=torch.from_numpy(seen.state))  # type: ignore[arg-type]
+
+    policy = as_policy(make_bc())
+    episode, expected = (rollout(make(), policy, 4) for make in (Reusing, ToyEnvironment))
+    np.testing.assert_array_equal(episode.executed, expected.executed)
+    assert episode.tool is not None
+    states = [seen.state for seen in episode.observations]
+    np.testing.assert_array_equal(episode.tool[:-1, :2].astype(np.float32), states)

@@ -26,7 +26,7 @@ from vla.models.model import Model
 from vla.schedule import Schedule
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation, RunningPlan, Spec
 
-PolicyInput = Observation | Mapping[str, Any] | Sequence[Observation]  # of one lane, or of several
+PolicyInput = Observation | Mapping[str, Any] | Sequence[Observation | Mapping[str, Any]]  # of one lane, or of several
 NO_PLAN = RunningPlan(np.empty((0, 1), np.float32), 0)  # no plan is executed
 LONG_SENTENCE = " ".join(["sentence"] * 24)  # shorter instructions are padded to it for a constant shape
 
@@ -179,7 +179,7 @@ class Policy:
 
     def _assign_lanes(self, observations: Any, lanes: Sequence[int]) -> dict[int, Observation]:
         """Return lane → its observation; a lane with another instruction begins an episode."""
-        lane_observations = dict(zip(lanes, observations, strict=True))
+        lane_observations = dict(zip(lanes, map(self._observation, observations), strict=True))
         for lane, observation in lane_observations.items():
             state = self._lanes.get(lane)
             if state is None or observation.instruction != state.instruction:

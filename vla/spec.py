@@ -154,7 +154,7 @@ class Spec:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings, for JSON and for checkpoints loaded with `weights_only=True`."""
-        values: dict[str, Any] = json.loads(json.dumps(asdict(self), default=lambda number: number.item()))
+        values: dict[str, Any] = json.loads(json.dumps(asdict(self), default=lambda number: number.tolist()))
         return values
 
     @classmethod
@@ -187,6 +187,7 @@ class Spec:
 
 def _fields(spec: Spec) -> dict[str, Any]:
     """Return field → value, with the fields of the robot under dotted names."""
+    spec = parse_plain(spec.to_dict(), Spec, "the spec")  # with tuples, where a world has lists or arrays
     robot = {f"robot.{name}": value for name, value in vars(spec.robot).items()} if spec.robot else {}
     return {**vars(spec), "robot": "an arm" if spec.robot else None, **robot}
 
@@ -252,8 +253,11 @@ class Observation:
         cameras = spec.required_images(values)
         if missing_keys := [name for name in (*cameras, "state", "instruction") if name not in values]:
             raise UserError(f"the observation has {', '.join(map(str, values))}, but lacks {', '.join(missing_keys)}")
-        rgb = {camera: values[camera] for camera in cameras}
-        return cls(rgb, values["state"], values["instruction"])
+        rgb = {camera: np.asarray(values[camera]) for camera in cameras}
+        instruction = np.asarray(values["instruction"])  # an array in dm_env
+        if instruction.shape or not isinstance(instruction.item(), str):
+            raise UserError(f"the observation's instruction must be a text, got {str(values['instruction'])[:50]}")
+        return cls(rgb, np.asarray(values["state"]), instruction.item())
 
 
 @dataclass(frozen=True)
@@ -339,7 +343,7 @@ class Environment(Protocol):
     spec: Spec
     task: str  # name of the task of this episode, such as "pick_place"; reports group by it
     done: bool  # the goal was reached and held, or the time is up
-    outcome: str  # "success" or why it is not (yet) one
+    outcome: str  # "success", "failure" if the episode ends because it can no longer be one, or why it is not (yet) one
     milestones: frozenset[str]  # reached so far in this episode, such as "grasped"
     draws: dict[str, Any]  # randomisation axis → values drawn at the last reset, JSON-able
 
@@ -463,7 +467,7 @@ class Exporter(Protocol):
     """Writer of demonstrations, or with `of_policies = True` of a policy, in another format."""
 
     def export(self, source: Any, cluster: Any, /) -> Any:
-        """Write a `vla.data.episodes.EpisodeStore` with a `vla.parallel.pool.Cluster`, or a `vla.policy.Policy`.
+        """Write a `vla.data.episodes.EpisodeStore` with a `vla.parallel.pool.Cluster`, or a `vla.policy.Policy` alone.
 
         Returns the path of the export.
         """

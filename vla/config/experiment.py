@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
 
-from vla.config.annotations import locate
-from vla.config.build import GROUPS, Group, build, require_no_paths
+from vla.config.annotations import is_node, locate, mismatch
+from vla.config.build import GROUPS, Group, arguments, build, require_no_paths
 from vla.config.differences import ABSENT, differences, value_at
 from vla.config.nodes import Collection, Evaluation, Settings, Validation, with_changes
 from vla.config.origin import SECRET, Origin, find_origin
@@ -364,8 +364,12 @@ def _model_node(nodes: Node, saved: SavedPolicy | None, weights: bool) -> Node:
 
 
 def _without_weights(model: Node) -> Node:
-    """Return a model node without pretrained weights, also of its encoders: the policy contains the trained ones."""
-    nodes = {name: node for name, node in model.items() if isinstance(node, dict)}
-    parts = {name: _without_weights(node) for name, node in nodes.items() if name in ("image", "context", "network")}
-    untrained = {"pretrained": False, "trunk": None}
-    return model | parts | {name: value for name, value in untrained.items() if name in model}
+    """Return a model node without pretrained weights, also of its parts: the policy contains the trained ones."""
+    changes: Node = {name: _without_weights(node) for name, node in model.items() if is_node(node)}
+    if is_node(model) and (names := [name for name in ("pretrained", "trunk") if name in model]):
+        parameters = arguments(locate("model._target_", model["_target_"]))
+        for name in names:  # each class has its own value for none
+            annotation = parameters[name].annotation if name in parameters else object
+            fitting = [value for value in (False, None) if not mismatch(name, value, annotation)]
+            changes |= {name: fitting[0]} if fitting else {}
+    return model | changes

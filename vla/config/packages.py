@@ -53,8 +53,11 @@ def config_folders() -> tuple[Path, ...]:
 
 @cache
 def option_folders() -> tuple[tuple[str, Path], ...]:
-    """Return (package, folder of options) of installed packages; raise a UserError if one has no such folder."""
-    folders = []
+    """Return (package, folder of options) of installed packages.
+
+    Raises a UserError if one has no such folder, or an option that another one, or `vla`, has already.
+    """
+    folders = [("vla", CONF)]
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.value):
         package, *parts = entry.value.split(".")
         spec = find_spec(package)
@@ -65,8 +68,15 @@ def option_folders() -> tuple[tuple[str, Path], ...]:
                 f"the installed package {package} names {entry.value} as its options, which is not a folder: its wheel "
                 "must include the YAML files"
             )
-        folders.append((package, folder.resolve()))
-    return tuple(folders)
+        folder = folder.resolve()
+        for option in sorted(path.relative_to(folder) for path in folder.rglob("*.yaml")):
+            if owners := [owner for owner, other in folders if other != folder and (other / option).is_file()]:
+                raise UserError(
+                    f"the installed packages {owners[0]} and {package} both have the option {option}, and the first "
+                    "would hide the second: rename one, or uninstall a package"
+                )
+        folders.append((package, folder))
+    return tuple(folders[1:])
 
 
 def trust(packages: Any, targets: Iterable[Any], node_packages: Iterable[Any] = ()) -> None:

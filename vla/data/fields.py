@@ -49,8 +49,8 @@ class ScatteredRows:
     def __len__(self) -> int:
         return self.shape[0]
 
-    def __getitem__(self, rows: slice) -> Array:
-        return self.take(np.arange(*rows.indices(len(self))))
+    def __getitem__(self, rows: slice | int) -> Array:
+        return self.take(np.array(range(len(self))[rows], np.int64))
 
     def take(self, index: Array, axis: int = 0, out: Array | None = None, mode: str = "raise") -> Array:
         """Take rows as `numpy.ndarray.take` does along axis 0; indices must be in bounds and `out` contiguous."""

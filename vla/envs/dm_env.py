@@ -69,5 +69,7 @@ def load(task: str, random_state: int | np.random.RandomState | None = None, **o
 
 
 def _arrays(observation: Observation) -> dict[str, Array]:
-    images = {camera: np.ascontiguousarray(image) for camera, image in observation.rgb.items()}  # for torch
-    return {**images, "state": observation.state, "instruction": np.array(observation.instruction, dtype=object)}
+    # Copies, because a world may reuse its arrays; contiguous for torch.
+    images = {camera: np.array(image, order="C") for camera, image in observation.rgb.items()}
+    state, instruction = np.array(observation.state, np.float32), np.array(observation.instruction, dtype=object)
+    return {**images, "state": state, "instruction": instruction}

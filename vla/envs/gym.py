@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
+from gymnasium.error import CustomSpaceError
 from gymnasium.spaces import Box, Dict, Text
+from gymnasium.vector.utils import create_shared_memory
 
 from vla.config.compose import compose_task
 from vla.config.experiment import make_environment
+from vla.io.errors import UserError
 from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Array, Environment, Observation
 
 UNBOUNDED = np.finfo(np.float32).max
@@ -27,6 +30,15 @@ class Sentence(Text):
         return f"Text({self.min_length}, {self.max_length})"
 
 
+@create_shared_memory.register(Sentence)
+def _refuse_shared_memory(space: Sentence, n: int = 1, ctx: Any = None) -> NoReturn:
+    """Make AsyncVectorEnv raise: of a text in shared memory it returns for ever what it reads before the first episode.
+
+    Its error says that shared_memory=False is the way out.
+    """
+    raise CustomSpaceError("instructions cannot be shared")
+
+
 class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
     """Adapter of an `Environment` to gymnasium.
 
@@ -38,7 +50,12 @@ class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
     def __init__(self, environment: Environment, render_mode: str | None = None) -> None:
-        """Wrap an environment; with "rgb_array", `render` returns the images of all cameras side by side."""
+        """Wrap an environment; with "rgb_array", `render` returns the images of all cameras side by side.
+
+        Raises a UserError for another mode.
+        """
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise UserError(f"render_mode={render_mode!r} is none of the modes: give rgb_array or None")
         self.environment, self.render_mode = environment, render_mode
         spec = environment.spec
         self.metadata = {**self.metadata, "render_fps": round(spec.control_hz)}
@@ -79,9 +96,10 @@ class GymEnvironment(gymnasium.Env[dict[str, Any], Array]):
         self._closed = True
 
     def _arrays(self, observation: Observation) -> dict[str, Any]:
-        self._images = list(observation.rgb.values())
-        images = {camera: np.ascontiguousarray(image) for camera, image in observation.rgb.items()}  # for torch
-        return {**images, "state": observation.state, "instruction": observation.instruction}
+        # Copies, because a world may reuse its arrays; contiguous for torch.
+        images = {camera: np.array(image, order="C") for camera, image in observation.rgb.items()}
+        self._images = list(images.values())
+        return {**images, "state": np.array(observation.state, np.float32), "instruction": observation.instruction}
 
     def _info(self) -> dict[str, Any]:
         outcome = self.environment.outcome

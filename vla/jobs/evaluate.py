@@ -40,6 +40,7 @@ from vla.rollouts.results import Report
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory
 from vla.rollouts.shared_policy import shared_policy
 from vla.rollouts.statements import BarStatement, RunStatement, Statement, differs_clearly
+from vla.runs.files import readable_config
 from vla.runs.folder import (
     CHECKPOINTS,
     PAGE,
@@ -212,10 +213,11 @@ def _play(
 def require_possible(experiment: Experiment) -> None:
     """Check, before any work, that the evaluation can be completed.
 
-    Raises a UserError if the run to compare with or a store is missing, there is nothing to decide, a policy, a network
-    or a condition is impossible, or the episodes selected the weights or are not distinct.
+    Raises a UserError if the run to compare with or a store is missing, there is nothing to decide, a policy, a
+    network, a condition or a tier is impossible, or the episodes selected the weights or are not distinct.
     """
     options, settings = experiment.evaluate, experiment.settings
+    readable_config(experiment.config)
     for name in (settings.checkpoint, settings.pretrained):
         if name:
             require_unseen(name, "evaluate.seed", options.seeds)  # whatever `validate` is now

@@ -207,8 +207,9 @@ class Learner(LightningModule):
         """Log the losses, and the error of the predicted actions of the newest frame per component."""
         for name, value in self.model.loss(batch).items():
             self.log(f"val/{name}", value, batch_size=len(batch["action"]), sync_dist=True)
+        seen = {name: batch[name] for name in ("rgb", "state", "present", "text")}  # no more than a policy gets
         with gather_weights(self.model):
-            actions = self.model.predict(batch).actions
+            actions = self.model.predict(seen).actions
         error = (actions - batch["action"][:, -1]).abs()[batch["valid"][:, -1]]  # (N, D)
         for index, (name, unit) in enumerate(zip(self._spec.action, self._spec.units, strict=True)):
             factor, unit_name = display_unit(unit)

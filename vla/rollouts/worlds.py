@@ -27,12 +27,12 @@ class Stage:
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of a seed; raise a UserError if it is over at its start."""
-        self._observation = self.environment.reset(seed)
+        self._observation = copy_observation(self.environment.reset(seed))
         if self.environment.done:
             raise UserError(f"the episode of seed {seed} is over at its start: `reset` must draw another one")
         self._seed, self._seen, self._labels, self._executed = seed, list[Observation](), list[Array](), list[Array]()
         # Read after the reset: the tool of a world may exist only from its first episode on.
-        self._tool = [getattr(self.environment, "tool", None)]
+        self._tool = [self._tool_position()]
         if self._recorder is not None:
             self._recorder.start(self.environment)
         return self._observation
@@ -43,16 +43,21 @@ class Stage:
         The label for imitation is `info["clean"]` if present, else the action. What the agent drew, `info["draws"]`, is
         added to the draws of the environment.
         """
-        self._seen.append(copy_observation(self._observation))
+        self._seen.append(self._observation)
         self._labels.append(np.array(info.get("clean", action), dtype=np.float32))
         self._executed.append(action)
         if self._recorder is not None:
             self._recorder.step(self._observation, action, info)
         with self.environment.blind() if blind else nullcontext():
-            self._observation = self.environment.step(action)
+            self._observation = copy_observation(self.environment.step(action))
         if self._tool[0] is not None:
-            self._tool.append(getattr(self.environment, "tool", None))
+            self._tool.append(self._tool_position())
         return self._end_episode(info) if self.environment.done else self._observation
+
+    def _tool_position(self) -> Array | None:
+        """Return a copy of the position of the tool, which a world may update in place; None if it has none."""
+        position = getattr(self.environment, "tool", None)
+        return None if position is None else np.array(position)
 
     def _end_episode(self, info: Mapping[str, Any]) -> Episode:
         environment: Any = self.environment  # which may have instructions
@@ -202,7 +207,7 @@ def _actions(agents: Agents, observations: Mapping[int, Observation], components
 
 
 def copy_observation(observation: Observation) -> Observation:
-    """Return a copy, with a float32 state, because a world may reuse its arrays."""
+    """Return a copy, of NumPy arrays with a float32 state: a world may reuse its arrays, or have those of PyTorch."""
     rgb, depth = (
         {name: np.array(image) for name, image in images.items()} for images in (observation.rgb, observation.depth)
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import pickle
 from collections.abc import Callable, Sequence
@@ -29,6 +30,14 @@ log = logging.getLogger(__name__)
 ROOM = 3  # memory of a process with a model, as a multiple of its weights: they arrive pickled, and the model acts
 GPU_PROCESS_MEMORY = 1e9  # of the GPU, and of the machine, that a process takes without its model [bytes]
 PER_WORKER = 5  # smallest number of episodes per process; fewer would take less time than its start
+
+
+class _WeightlessPickler(pickle.Pickler):
+    """Pickler that leaves out tensors, which would take time and memory."""
+
+    def reducer_override(self, value: Any) -> Any:
+        """Replace a tensor by a number."""
+        return (int, ()) if isinstance(value, torch.Tensor) else NotImplemented
 
 
 class ClosedLoop(Callback):
@@ -72,13 +81,15 @@ class ClosedLoop(Callback):
             self._pool = None
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Build the environment before training, in case this machine cannot."""
+        """Build the environment and pickle the model, but for its weights, before training, in case that fails."""
         assert isinstance(pl_module, Learner)
         self._enabled = pl_module.device_mesh is None and trainer.enable_validation
         if self._enabled:
             environment = self._make_environment()
             environment.close()
             pl_module.model.spec.require_input(environment.spec, "the demonstrations", "the task")
+            if min(self._workers, len(self._seeds) // PER_WORKER) > 1:  # else this process plays
+                _WeightlessPickler(io.BytesIO()).dump(pl_module.model)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Play the episodes; later callbacks restore the weights in training."""

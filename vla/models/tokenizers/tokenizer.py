@@ -27,6 +27,9 @@ MIN_SPAN = 0.05
 class ActionTokenizer(nn.Module, ABC):
     """Base class of action tokenizers; bounds and other fitted values are saved in checkpoints.
 
+    What a constructor computes from `statistics` must be in buffers, or in the extra state of a module: a training and
+    a policy load it into a tokenizer that was built without them.
+
     Args:
         spec: names the components.
         low, high: (D,) bounds of the encoded actions, in the units of the action.
