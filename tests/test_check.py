@@ -33,6 +33,7 @@ GRAMMAR = {
 }
 SHAPES = {"_target_": "vla.tasks.tabletop.randomize.blocks.Shapes"}
 MASSES = {"_target_": "vla.tasks.tabletop.randomize.blocks.Masses", "factor": [0.5, 2.0]}
+STAY = {"_target_": "vla.tasks.tabletop.goals.skills.Stay", "language": GRAMMAR}
 WAYPOINT = {"_target_": "vla.tasks.tabletop.expert.Waypoint", "_partial_": True}
 PERTURBED = {"_target_": "vla.tasks.perturb.Perturbed", "expert": WAYPOINT}
 
@@ -113,6 +114,7 @@ def test_a_list_of_what_there_is_names_nothing_twice() -> None:
         ("task.randomize.shape", {**SHAPES, "names": ["ball"]}, "task.randomize.shape.names[0] must be 'cube', 'cyl"),
         ("task.goal.language.held_out_colours", ["grean"], "task.goal.language.held_out_colours[0] must be 'red', "),
         ("task.meshes", "lite", "task.meshes must be 'light' or 'full', got 'lite', did you mean light?"),
+        ("task.goal", {**STAY, "pads": 3}, "task.goal.pads must be less than or equal to 2, got 3"),
         ("evaluate.recordings", "x", "evaluate.recordings must be 'all' or 'failures' or a valid integer, got 'x'"),
     ],
 )

@@ -59,6 +59,9 @@ def test_a_condition_without_an_episode_is_refused_before_any_is_played() -> Non
     asked = composed("task/randomize=wide", "task.blocks=6", "evaluate=language", "agent=expert")
     with pytest.raises(ValueError, match=r"condition impossible of the evaluation: task\.blocks must be from 2 to 5"):
         require_possible(Experiment.from_config(asked))
+    asked = composed("task.blocks=3", "evaluate=paper")  # whose conditions change different axes
+    with pytest.raises(ValueError, match=r"condition distractors of the evaluation: .* needs task\.blocks=4 or more"):
+        require_possible(Experiment.from_config(asked))
 
 
 @pytest.mark.parametrize(

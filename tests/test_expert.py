@@ -159,6 +159,8 @@ def test_components_that_are_not_there_are_named() -> None:
         in_the_toy_world(toy.SPEC, toy.ToyExpert, tool="hand")
     with pytest.raises(ValueError, match="names dz, but an action has x, y, gripper"):
         Perturbation((0, 0, 0), (5, 5, 5), **TOY | {"move": ("x", "y", "dz")}).reset(toy.SPEC, 0)
+    with pytest.raises(ValueError, match=r"expert\.perturb\.low must not exceed high, got \[0, 6\] and \[5, 5\]"):
+        Perturbation((0, 6), (5, 5), **TOY)
 
 
 class Walker(toy.ToyExpert):

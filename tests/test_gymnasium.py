@@ -119,6 +119,8 @@ def test_state_entries_with_one_name_are_told_apart_by_their_paths() -> None:
             {"state": {"observation.state": ["east", "east"]}},
             "task.id=toy/Toy-v0",
         ),
+        ({"state": {"observation": None}}, "observation is no array of numbers, but of dict"),
+        ({"truth": {"words": "observation.instruction"}}, "observation.instruction is no array of numbers, but of str"),
         (
             {"options": {"seconds_per_stop": 0.1}},
             "toy/Toy-v0 cannot be made with task.options={'seconds_per_stop'",
@@ -129,6 +131,14 @@ def test_state_entries_with_one_name_are_told_apart_by_their_paths() -> None:
 def test_what_does_not_fit_is_named(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=re.escape(words)):
         make(**changes)
+
+
+@pytest.mark.parametrize("path", ["info.truth", "info.truth.point", "observation.instruction"])
+def test_success_is_a_flag(path: str) -> None:
+    world = make(success=path)
+    world.reset(0)
+    with pytest.raises(ValueError, match=rf"task\.success={re.escape(path)} must be a flag, and is of "):
+        world.step(np.zeros(3, np.float32))
 
 
 def test_success_that_is_never_told_is_named_once(caplog: pytest.LogCaptureFixture) -> None:

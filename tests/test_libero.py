@@ -176,6 +176,12 @@ def test_one_share_of_drawn_starts_changes_nothing_else() -> None:
     assert len(happened) == 4
 
 
+def test_what_is_not_exchanged_is_not_told_to_be() -> None:
+    with closing(world("long_task 8", "task.randomize.places=1")) as pots, pots.blind():  # only one thing may move
+        pots.reset(0)
+        assert not pots.draws["start"]["exchanged"]
+
+
 def test_all_suites_have_ten_tasks_and_sentences() -> None:
     assert len(set(world().tasks)) == len({task.instruction for suite in SUITES for task in tasks_of(suite)}) == 40
     assert world("[goal,long] 1,2").tasks == ("goal_1", "goal_2", "long_1", "long_2")

@@ -240,7 +240,10 @@ def require_possible(experiment: Experiment) -> None:
         raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
     _require_own(experiment, output)
     # Worlds take time to compile: one is built for all conditions that change the same arguments; nodes were checked.
-    kinds = {frozenset(changes): (name, changes) for name, changes in reversed(options.changes.items())}
+    # Before hours of training it is one for the same parts of these, such as `randomize`.
+    trains = experiment.checkpoint is None and not experiment.nodes.get("agent")
+    key = _changed_parts if trains else frozenset
+    kinds = {key(changes): (name, changes) for name, changes in reversed(options.changes.items())}
     for name, changes in kinds.values() if experiment.playable else ():
         try:
             with closing(experiment.make_environment(changes)()) as world, world.blind():
@@ -251,6 +254,11 @@ def require_possible(experiment: Experiment) -> None:
         for name, changes in {IN_DISTRIBUTION: {}, **options.changes}.items():
             with closing(experiment.make_environment(changes)()) as world:
                 _require_distinct(name, world, options)
+
+
+def _changed_parts(changes: Mapping[str, Any]) -> frozenset[tuple[str, ...]]:
+    """Return the arguments that a condition changes, each followed by those within, if it is a node."""
+    return frozenset((name, *(value if isinstance(value, Mapping) else ())) for name, value in changes.items())
 
 
 def _require_usable(experiment: Experiment) -> None:

@@ -76,7 +76,7 @@ class Gymnasium(World):
 
         Raises:
             UserError: the package is not installed or does not contain the environment, an action has no bounds, an
-                observation lacks a path, or arguments do not fit each other.
+                observation lacks a path or has no numbers there, or arguments do not fit each other.
         """
         super().__init__()
         self._truth, self._images, self._success, self._instruction = truth or {}, images, success, instruction
@@ -127,6 +127,8 @@ class Gymnasium(World):
         observation, _, terminated, truncated, info = self._environment.step(command)
         values = self._values(observation, info)
         success = _get(values, self._success, None)
+        if isinstance(success, Mapping | str) or np.size(success) != 1:  # whose truth is not that of a flag
+            raise UserError(f"task.success={self._success} must be a flag, and is of {type(success).__name__}")
         self.outcome = "success" if success else "failure" if terminated else "timeout"
         self.done = bool(success) or terminated or truncated
         self._success_reported |= success is not None
@@ -147,9 +149,9 @@ class Gymnasium(World):
         images, instruction = {} if self._blind else self._images, self._instruction
         return Observation(
             rgb={name: _resize(name, _get(values, path), self._size) for name, path in images.items()},
-            state=np.concatenate([np.ravel(_get(values, path)) for path in self._state]).astype(np.float32),
+            state=np.concatenate([_numbers(values, path) for path in self._state]),
             instruction=str(_get(values, instruction)) if instruction.startswith(PATHS) else instruction,
-            truth={name: np.ravel(_get(values, path)).astype(np.float32) for name, path in self._truth.items()},
+            truth={name: _numbers(values, path) for name, path in self._truth.items()},
         )
 
 
@@ -205,6 +207,15 @@ def _get(values: Any, path: str, *default: Any) -> Any:
             raise UserError(f"there is no {path} in what the environment returns: instead of {name} there is {names}")
         value = value[name]
     return value
+
+
+def _numbers(values: Any, path: str) -> Array:
+    """Return the numbers (N,) float32 at a dotted path; a UserError if there is something else."""
+    value = _get(values, path)
+    try:
+        return np.ravel(value).astype(np.float32)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{path} is no array of numbers, but of {type(value).__name__}: {error}") from error
 
 
 def _labels(paths: Sequence[str]) -> Sequence[str]:

@@ -27,7 +27,7 @@ class Perturbation:
     open or closed at random. Only a gripper misses grasps.
 
     Raises:
-        UserError: `low`, `high` and `move` differ in length.
+        UserError: `low`, `high` and `move` differ in length, or `low` exceeds `high`.
     """
 
     low: Corner  # lower corner of the box of excursion targets, in the frame of the actions [m]
@@ -49,10 +49,12 @@ class Perturbation:
     pace: PositiveRange
 
     def __post_init__(self) -> None:
-        """Check that the corners have one coordinate per component of `move`."""
+        """Check that the corners have one coordinate per component of `move`, and span a box."""
         low, high, move = len(self.low), len(self.high), len(self.move)
         if not low == high == move:
             raise UserError(f"expert.perturb.low, high and move must be equally long, not {low}, {high} and {move}")
+        if (np.array(self.low) > self.high).any():
+            raise UserError(f"expert.perturb.low must not exceed high, got {[*self.low]} and {[*self.high]}")
 
     def reset(self, spec: Spec, seed: int) -> None:
         """Draw the pace of an episode and its first excursion (UserError: the actions lack a named component)."""

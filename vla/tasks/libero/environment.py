@@ -121,7 +121,7 @@ class Libero(MultitaskWorld):
         state = (seed - FIRST_SEED) // len(self._tasks) % STATES if FIRST_SEED <= seed < END else None
         # One generator each, so that changing a share does not change the other draws.
         random, places, colours = (np.random.default_rng(key) for key in (seed, [seed, 4], [seed, 5]))
-        exchanged = state is None and places.random() < self._randomize.places
+        exchanged = state is None and starts.can_exchange and places.random() < self._randomize.places
         coloured = state is None and colours.random() < self._randomize.colours
         start = starts.draw(random, exchanged) if state is None else starts.official(state)
         self.draws = {

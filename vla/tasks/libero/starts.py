@@ -58,6 +58,7 @@ class Starts:
         self._usual = self._overlaps(self.official(0))  # pairs that always overlap, such as a drawer and its cabinet
         self._owners = {part[1]: part[2] for part in task.initial if part[0] in ("on", "in")}
         self._exchangeable = [thing for thing in self._owners if self._may_move(thing)]
+        self.can_exchange = len(self._exchangeable) > 1
 
     def official(self, number: int) -> Start:
         """Return an official start, with the fixtures as in the task, because its state does not contain them."""
@@ -98,7 +99,7 @@ class Starts:
 
     def _draw(self, random: np.random.Generator, exchanged: bool) -> Start:
         start, model, owners = self.official(0), self._model, dict(self._owners)
-        if exchanged and len(self._exchangeable) > 1:
+        if exchanged and self.can_exchange:
             order = random.permutation(self._exchangeable).tolist()
             for one, other in zip(order[0:4:2], order[1:4:2], strict=False):
                 owners[one], owners[other] = owners[other], owners[one]

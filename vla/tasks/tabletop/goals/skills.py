@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Annotated
 
-from vla.io.types import Count, Inherited, Positive
+import numpy as np
+from annotated_types import Ge, Le
+
+from vla.io.types import Inherited, Positive
 from vla.tasks.tabletop.goals.goal import AT_REST, Arrangement, Goal, Referents, Subgoal, WorldState
 from vla.tasks.tabletop.language import Grammar, Silence
+from vla.tasks.tabletop.scene import PADS
+
+Pads = Annotated[int, Ge(1), Le(len(PADS))]
 
 LEFT = 0.06  # distance at which the tool has left a block [m]
 SAG = 0.006  # tolerance of a stacked block's height [m]
@@ -129,7 +135,7 @@ class Stack(Goal):
 class Stay(Goal):
     """Leave everything in place, because the instruction names a block that is not on the table."""
 
-    def __init__(self, language: Grammar, pads: Count) -> None:
+    def __init__(self, language: Grammar, pads: Pads) -> None:
         """Take a grammar and the number of pads on the table."""
         self.pads, self.absent = pads, absent_colours_needed(language)
         super().__init__(language, REST_STEPS)
@@ -150,7 +156,7 @@ class Stay(Goal):
 class Wait(Stay):
     """Leave everything in place, because the instruction is empty."""
 
-    def __init__(self, pads: Count) -> None:
+    def __init__(self, pads: Pads) -> None:
         """Take the number of pads on the table."""
         super().__init__(Silence(), pads)
         self.absent = 0
