@@ -205,8 +205,8 @@ def test_what_lies_beyond_the_bounds_is_counted() -> None:
     chunks = BOUNDS.chunks(1).copy()
     assert out_of_bounds(tokenizer, chunks) == 0
     assert all(out_of_bounds(fitted, CHUNKS.numpy()) == 0 for fitted in EVERY.values())
-    chunks[0, 0, 0] = 9.0
-    assert out_of_bounds(tokenizer, chunks) == pytest.approx(1 / chunks.size)
+    chunks[0, 0, :2] = 9.0  # in one action
+    assert out_of_bounds(tokenizer, chunks) == pytest.approx(1 / len(chunks))
 
 
 def test_tokens_are_drawn_from_the_targets() -> None:

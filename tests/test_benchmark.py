@@ -106,6 +106,17 @@ def test_a_benchmark_says_where_its_figures_are(
     assert caplog.messages[-1] == f"wrote {tmp_path / 'benchmark.json'}" and (tmp_path / "benchmark.json").is_file()
 
 
+def test_an_evaluation_is_measured_without_further_conditions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    played: list[Experiment] = []
+    monkeypatch.setattr("vla.jobs.evaluate.run", played.append)
+    options = ("evaluate=language", "evaluate.until=decided", "evaluate.seed=1000005", f"output={tmp_path}")
+    measures = acting.evaluate(Experiment.from_config(composed("job=benchmark", "benchmark.episodes=3", *options)))
+    assert measures["evaluate"]["n"] == 3 and len(played) == 2
+    for evaluation in (trial.evaluate for trial in played):
+        assert not evaluation.changes and evaluation.until is None
+        assert evaluation.seeds == range(1_000_005, 1_000_008) and evaluation.recordings == "all"
+
+
 class Peer:
     """Another implementation of a model, which is the model itself and errs by `error`."""
 

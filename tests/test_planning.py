@@ -13,6 +13,7 @@ from finished_runs import a_run
 from rich import get_console
 from scipy.stats import binom, multinomial
 
+from vla.jobs.plan import _percent
 from vla.rollouts.comparison import fisher, mcnemar
 from vla.rollouts.planning import (
     MAX_EPISODES,
@@ -92,6 +93,10 @@ def test_stopping_is_as_late_as_in_simulated_evaluations() -> None:
         ended.append(decided[0] if decided else np.inf)
     assert np.mean(np.isfinite(ended)) == pytest.approx(0.8, abs=0.08)
     assert np.minimum(ended, stops.max_episodes).mean() == pytest.approx(stops.mean, rel=0.08)
+
+
+def test_a_rate_below_one_is_not_rounded_to_it() -> None:
+    assert [_percent(rate) for rate in (0.9995, 0.97, 0.97 - 0.95)] == ["99.95 %", "97 %", "2 %"]
 
 
 def test_the_command_prints_a_row_per_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import composing
@@ -26,11 +27,12 @@ from vla.config.experiment import to_plain
 from vla.data.datamodule import is_held_out
 from vla.data.derivation import derive_store
 from vla.data.episodes import EpisodeStore
-from vla.data.formats.imported_demonstrations import action_bounds
+from vla.data.formats.imported_demonstrations import action_bounds, log_clipped
 from vla.data.verification import episode_of
 from vla.deploy.client_observation import Keys
 from vla.deploy.control_loop import ControlLoop
 from vla.io.images import resize
+from vla.jobs.open_loop import _measure
 from vla.models.policy_folder import read_policy
 from vla.reports.open_loop import components, errors_table
 from vla.robots.controllers import controller_for
@@ -345,6 +347,25 @@ def test_errors_are_means_over_recordings_with_an_interval() -> None:
     np.testing.assert_allclose(split.mean, [3] * 3, rtol=1e-5)
     np.testing.assert_allclose(split.interval[1], [3 + 12.7062] * 3, rtol=1e-4)
     assert split.relative == pytest.approx(float((split.mean / split.constant_errors).mean()))
+
+
+def test_the_share_of_clipped_actions_is_of_whole_actions(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO", "vla"):
+        log_clipped(np.array([[91.0, 0.0, 0.0], [0.0, 90.0, 0.0]], np.float32), SPEC)
+    assert caplog.messages == ["50 % of the actions are clipped to the bounds of the task"]
+
+
+def test_the_constant_action_is_the_mean_of_all_episodes_of_a_training(tmp_path: Path) -> None:
+    stores = [EpisodeStore.create_or_open(tmp_path / name, SPEC, {}) for name in ("first", "more")]
+    for number, store in enumerate(stores):
+        with store.writing():
+            for seed in range(4 * number, 4 * number + 4):
+                store.append(episode(seed))
+    nodes: Any = SimpleNamespace(evaluate=SimpleNamespace(episodes=9), collect=SimpleNamespace(more=[stores[1].folder]))
+    result = _measure(nodes, stores[0], 0.4, Behind())
+    trained = [episode(seed).actions for seed in range(8) if not is_held_out(seed, 0.4)]
+    errors = [np.abs(recorded - np.concatenate(trained).mean(0)).mean(0) for recorded in result.recorded]
+    np.testing.assert_allclose(result.constant_errors, np.mean(errors, 0), rtol=1e-5)
 
 
 def test_units_are_tabulated_where_there_are_some() -> None:

@@ -216,10 +216,11 @@ class WindowDataModule(LightningDataModule):
         rank, processes = self._place()
         global_batch = self.batch_size * processes
         batches = max(1, min(self._validation_windows, len(self.held_out_windows)) // global_batch)
-        # Whole batches: one shape for a compiled model, and the same number of steps in all processes.
+        # Whole batches: one shape for a compiled model, and the same number of steps in all processes. Each is spread
+        # over all episodes: where stores lack the truth, batches of such windows alone would count as losses of 0.
         indices = np.linspace(0, len(self.held_out_windows) - 1, batches * global_batch).round().astype(np.int64)
-        windows = self.held_out_windows[indices].reshape(batches, self.batch_size, processes)
-        return Prefetcher(self.make_batch, lambda: windows[:, :, rank], self.ahead, batches)
+        windows = self.held_out_windows[indices].reshape(self.batch_size, batches, processes)
+        return Prefetcher(self.make_batch, lambda: windows[:, :, rank].T, self.ahead, batches)
 
     def order(self, step: int, rank: int = 0, processes: int = 1) -> Array:
         """Return the windows (B,) of training step `step` in process `rank`, as row numbers.

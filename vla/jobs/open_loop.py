@@ -28,6 +28,7 @@ from vla.reports.run_page import write_page
 from vla.rollouts.open_loop import OpenLoop, open_loop
 from vla.rollouts.rollout import close_agent
 from vla.runs.folder import ERRORS, ERRORS_PLOT, PAGE, describe_files, save_config
+from vla.spec import Array
 
 log = logging.getLogger(__name__)
 
@@ -122,7 +123,10 @@ def _measure(experiment: Experiment, store: EpisodeStore, fraction: float, polic
             f"{store.folder} out of training, but some must be held out and some not: record more, or train with "
             "another fraction"
         )
-    actions = store.rows("action")
-    constant = np.concatenate([actions[entry.span] for entry in parts[False]]).mean(0)
-    entries = track(parts[True][: experiment.evaluate.episodes], "evaluating")
-    return open_loop(policy, store.spec, (episode_of(store, entry) for entry in entries), constant)
+    actions = list[Array]()
+    for training_store in (store, *map(EpisodeStore, experiment.collect.more or ())):
+        entries, rows = training_store.episodes, training_store.rows("action")
+        actions += [rows[entry.span] for entry in entries if not is_held_out(recording_of(entry), fraction)]
+    constant = np.concatenate(actions).mean(0)
+    held_out = track(parts[True][: experiment.evaluate.episodes], "evaluating")
+    return open_loop(policy, store.spec, (episode_of(store, entry) for entry in held_out), constant)

@@ -91,4 +91,4 @@ def _numbers(fixed: int | None, stops: Stopping | None) -> tuple[str, ...]:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"
+    return f"{100 * share:.4g} %"  # of 99.95 % three digits would be 100

@@ -98,7 +98,7 @@ def read_training(folder: Path) -> Training | None:
 
 def archive_evaluation(folder: Path, number: int) -> None:
     """Append `number`, of steps or rounds, to the names of an evaluation's files: more training changes the policy."""
-    for file in (folder / name for name in (REPORT, ERRORS, RECORDING)):
+    for file in (folder / name for name in (REPORT, PLOT, SUITE, ERRORS, ERRORS_PLOT, RECORDING)):
         if file.exists():
             file.replace(folder / f"{file.stem}_{number}{file.suffix}")
 

@@ -160,5 +160,5 @@ def out_of_bounds(actions: Array, spec: Spec, max_share: float) -> list[str]:
 def log_clipped(actions: Array, spec: Spec) -> None:
     """Log how many of the (N, D) actions are clipped to the bounds of a spec."""
     clipped = np.clip(actions, np.array(spec.low, np.float32), np.array(spec.high, np.float32))
-    if share := float((clipped != actions).mean()):
+    if share := float((clipped != actions).any(axis=1).mean()):
         log.info("%.2g %% of the actions are clipped to the bounds of the task", 100 * share)

@@ -62,10 +62,12 @@ def _require_equal(peer_actions: Tensor, actions: Tensor) -> None:
 
 def evaluate(experiment: Experiment) -> dict[str, Measure]:
     """Measure `job=evaluate` with every recording, in episodes per second; the floor is the same without recordings."""
-    count, rates = experiment.options(Benchmark).episodes, []
-    for recorder in (to_plain(compose().recorder), None):
+    count, rates, default = experiment.options(Benchmark).episodes, [], compose()
+    # Further conditions would play more episodes than are counted, and early stopping fewer.
+    options = to_plain(default.evaluate) | {"seed": experiment.evaluate.seed, "episodes": count, "recordings": "all"}
+    for recorder in (to_plain(default.recorder), None):
         with TemporaryDirectory() as folder:
-            values = {"job": "evaluate", "evaluate.episodes": count, "evaluate.recordings": "all"}
-            trial = experiment.with_values({**values, "recorder": recorder, "output": folder})
+            values = {"job": "evaluate", "evaluate": options, "recorder": recorder, "output": folder}
+            trial = experiment.with_values(values)
             rates.append(count / timed(partial(import_module("vla.jobs.evaluate").run, trial))[1])
     return {"evaluate": measure(rates[0], "episodes/s", count, rates[1])}

@@ -54,7 +54,7 @@ def collect(experiment: Experiment) -> dict[str, Measure]:
     if "rendering" in times:
         measures |= _renderers(experiment)
     work = partial(DemonstrationWorker, *makers)
-    single_rate, total_rate = (_verified_rate(work, processes, count) for processes in (1, cores()))
+    (single_rate, _), (total_rate, steps) = (_verified_rate(work, processes, count) for processes in (1, cores()))
     measures[f"collect: {cores()} processes"] = measure(total_rate, unit, steps, cores() * single_rate)
     return measures
 
@@ -122,10 +122,11 @@ def _options() -> dict[str, Any]:
     return renderers
 
 
-def _verified_rate(make: WorkerFactory, processes: int, episodes_each: int) -> float:
-    """Return the rate of verified control steps [1/s] of concurrent processes after a warm-up."""
+def _verified_rate(make: WorkerFactory, processes: int, episodes_each: int) -> tuple[float, int]:
+    """Return the rate of verified control steps [1/s] of concurrent processes after a warm-up, and their number."""
     with Cluster(processes, "beside").pool(make) as pool:
         play = lambda seeds: [attempt.result() for attempt in [pool.submit(seed) for seed in seeds]]  # noqa: E731
         play(range(2 * processes))
         episodes, seconds = timed(partial(play, range(processes * episodes_each)))
-    return sum(len(episode.actions) for episode in episodes) / seconds
+    steps = sum(len(episode.actions) for episode in episodes)
+    return steps / seconds, steps

@@ -245,9 +245,9 @@ def data_bounds(spec: Spec, statistics: ActionStatistics | None, margin: float =
 
 
 def out_of_bounds(tokenizer: ActionTokenizer, chunks: np.ndarray) -> float:
-    """Return the share of (N, k, D) values outside the bounds of a tokenizer by more than a rounding error."""
+    """Return the share of (N, k, D) actions outside the bounds of a tokenizer by more than a rounding error."""
     actions, slack = torch.from_numpy(np.array(chunks, np.float32)), 1e-4 * (tokenizer.high - tokenizer.low)
-    return float(((actions < tokenizer.low - slack) | (actions > tokenizer.high + slack)).float().mean())
+    return float(((actions < tokenizer.low - slack) | (actions > tokenizer.high + slack)).any(-1).float().mean())
 
 
 def rounding(tokenizer: ActionTokenizer, chunks: np.ndarray, spec: Spec) -> tuple[str, float]:
