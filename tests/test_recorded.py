@@ -390,7 +390,7 @@ def test_joint_positions_in_degrees_move_a_robot_in_radians() -> None:
     world.joints, world.cameras = np.array([0.1, 0.2, 0.3]), [*spec.cameras]
     goal = np.array([[30.0, -45.0, 120.0]], np.float32)  # the last one is clipped to 90 degrees, and by the limits
     world.answer = lambda observation: (seen.append(observation.state), goal)[1]
-    held = world.run(0.1)
+    held = world.run(0.32)
     world.loop.on_instruction("move", world.now)
     commands = [command.position for command in (*held, *world.run(2.9))]
     assert len(commands) == 150
