@@ -63,6 +63,7 @@ BAD_INPUT = {
     "-m job=plan hydra.sweep.subdir=${seed}/x": "a sweep's table needs a single name for each cell",
     "-m job=plan hydra.output_subdir=null": "1 of 1 cells failed",
     "job=plan -m plan.rates=[0.5,0.5]": "are equal: no number of episodes tells them apart",
+    "-m plan seed=0,1": "cannot read plan",
     "-m experiment=ablation variant=no_transformer model=rt1_small seed=0": "sets model=bc: omit model=rt1_small",
     "experiment=recipe": "experiment=recipe is a grid of runs: add -m",
     f"seed={'[' * 200}{']' * 200}": "nested too deep",

@@ -18,6 +18,7 @@ from vla.config import packages
 from vla.config.adopt import adopt
 from vla.config.build import build
 from vla.config.experiment import to_plain
+from vla.rollouts.rollout import rollout
 from vla.spec import Environment
 from vla.tasks.gymnasium import Gymnasium
 
@@ -139,6 +140,12 @@ def test_success_is_a_flag(path: str) -> None:
     world.reset(0)
     with pytest.raises(ValueError, match=rf"task\.success={re.escape(path)} must be a flag, and is of "):
         world.step(np.zeros(3, np.float32))
+
+
+def test_a_world_may_have_tensors() -> None:
+    tensors, arrays = (rollout(make(id=f"toy/{kind}-v0"), toy.ToyExpert(), 0) for kind in ("Tensors", "Toy"))
+    assert tensors.outcome == arrays.outcome == "success"
+    np.testing.assert_array_equal(tensors.executed, arrays.executed)
 
 
 def test_success_that_is_never_told_is_named_once(caplog: pytest.LogCaptureFixture) -> None:

@@ -345,6 +345,10 @@ def test_a_bug_gives_a_traceback_and_so_does_a_mistake_where_asked(
         here(tmp_path, "job=report")
 
 
+def test_an_option_without_its_value_may_be_last(tmp_path: Path) -> None:
+    assert "job: plan" in here(tmp_path, "job=plan", "--info").stdout
+
+
 def test_variants_are_found_in_a_folder_of_options_of_the_user(tmp_path: Path) -> None:
     (tmp_path / "mine/experiment").mkdir(parents=True)
     text = "# @package _global_\nvariant: equal\nvariants:\n  equal: ['plan.rates=[0.5,0.5]']\n"

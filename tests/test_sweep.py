@@ -28,7 +28,7 @@ from vla.rollouts.sequential import anytime_interval
 from vla.rollouts.statistics import pooled_interval
 from vla.run import SWEEP, _end
 from vla.runs.folder import read_run
-from vla.runs.sweep import SweepRow, read_rows, save_failure
+from vla.runs.sweep import SweepRow, describe_failures, read_rows, save_failure
 from vla.spec import FIRST_SEED
 
 
@@ -154,6 +154,9 @@ def test_where_a_cell_fails_the_table_has_the_others_too(tmp_path: Path, capsys:
     )
     told = (tmp_path / "sweep.md").read_text()
     assert "| 12 | 90.0 (" in told and "- failed: 2 data.seed=2: no room" in told
+    (tmp_path / "13").mkdir()
+    save_failure(tmp_path / "13", "hydra.output_subdir=None")  # so that its overrides are not known
+    assert describe_failures(tmp_path).endswith("\n  13: hydra.output_subdir=None")
 
 
 def test_agents_without_a_model_are_rows_too(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
 from toy import ToyEnvironment
 
 from vla.envs.gym import GymEnvironment
@@ -35,6 +36,19 @@ class Twice(Toy):
         return {**info, "state": own, "truth": {**info["truth"], "state": own}}
 
 
+class Tensors(Toy):
+    """The toy world, with tensors of PyTorch."""
+
+    def _arrays(self, observation: Observation) -> dict[str, Any]:
+        arrays = super()._arrays(observation)
+        return {**arrays, **{name: torch.from_numpy(arrays[name]) for name in ("eye", "state")}}
+
+    def _info(self) -> dict[str, Any]:
+        info = super()._info()
+        truth = {name: torch.from_numpy(np.array(value)) for name, value in info["truth"].items()}
+        return {**info, "is_success": torch.tensor([info["is_success"]]), "truth": truth}
+
+
 class Unbounded(Toy):
     """The toy world, which does not tell the bounds of its actions."""
 
@@ -44,6 +58,7 @@ class Unbounded(Toy):
 
 
 gymnasium.register("toy/Twice-v0", "toy_gym:Twice", max_episode_steps=500)
+gymnasium.register("toy/Tensors-v0", "toy_gym:Tensors", max_episode_steps=500)
 gymnasium.register("toy/Unbounded-v0", "toy_gym:Unbounded", max_episode_steps=500)
 gymnasium.register("toy/Toy-v0", "toy_gym:Toy", max_episode_steps=500)
 gymnasium.register("toy/Endless-v0", "toy_gym:Toy")

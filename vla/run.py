@@ -250,15 +250,15 @@ def _compose(cfg: DictConfig) -> float | None:
         _end(error)
 
 
-def _options_first(arguments: list[str]) -> list[str]:
-    """Move overrides behind the options, because argparse takes them from one place only."""
-    options, overrides, before = list[str](), list[str](), ""
+def _overrides_first(arguments: list[str]) -> list[str]:
+    """Move overrides before the options: argparse takes them from one place only, and behind `--info` as its value."""
+    overrides, options, before = list[str](), list[str](), ""
     for argument in arguments:
-        is_value = before.startswith(("-c", "--config")) and "=" not in before  # of an option
-        is_override = not is_value and argument[:1] != "-" and ("=" in argument or argument[:1] == "~")
-        (overrides if is_override else options).append(argument)
+        takers = ("-c", "--c") if "=" in argument else ("-c", "--c", "-i", "--i", "-p", "--p")
+        is_value = before.startswith(takers) and "=" not in before  # of an option
+        (options if is_value or argument[:1] == "-" else overrides).append(argument)
         before = argument
-    return options + overrides
+    return overrides + options
 
 
 def _require_plain(arguments: list[str]) -> None:
@@ -309,7 +309,7 @@ def main() -> None:
     os.environ.setdefault(TRACEBACKS, os.environ.get("HYDRA_FULL_ERROR", "0"))
     os.environ["HYDRA_FULL_ERROR"] = "1"  # otherwise Hydra prints errors itself
     arguments, ros.arguments[:] = ros.split_arguments(sys.argv[1:])
-    sys.argv[1:] = _options_first(arguments)
+    sys.argv[1:] = _overrides_first(arguments)
     try:
         _require_plain(sys.argv[1:])
         _require_options(sys.argv[1:])

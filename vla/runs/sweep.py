@@ -100,7 +100,7 @@ def failures(folder: Path) -> list[str]:
     keys = varied_keys(list(choices_of.values()))
     lines = []
     for cell in cells(folder, FAILURE):
-        choices = "".join(f" {key}={choices_of[cell][key]}" for key in keys if key in choices_of[cell])
+        choices = "".join(f" {key}={choices_of[cell][key]}" for key in keys if key in choices_of.get(cell, ()))
         reason = read_bounded(cell / FAILURE).decode("utf-8", "replace").partition("\n")[0]
         lines.append(f"{cell.name}{choices}: {reason}")
     return lines

@@ -91,7 +91,7 @@ class Gymnasium(World):
             raise UserError(f"task.id={id} cannot be played: {error}") from error
         names = list[str]()
         for (path, components), label in zip(state.items(), _labels([*state]), strict=True):
-            names += _component_names(path, _get(values, path), components, label)
+            names += _component_names(path, _numbers(values, path), components, label)
         actions = _component_names("action", space.low, action, "action")
         state_units, action_units = units_of(units, names, actions)
         rate = control_hz or self._environment.metadata.get("render_fps")
@@ -107,7 +107,7 @@ class Gymnasium(World):
             low=_bound("low", low, space.low),
             high=_bound("high", high, space.high),
             control_hz=float(rate),
-            truth=tuple((name, np.size(_get(values, path))) for name, path in self._truth.items()),
+            truth=tuple((name, _numbers(values, path).size) for name, path in self._truth.items()),
         )
         self.spec = Spec.from_dict(spec.to_dict(), f"task.id={id}")
         self._observe(values)  # raises if an image is of another shape or type
@@ -127,7 +127,7 @@ class Gymnasium(World):
         observation, _, terminated, truncated, info = self._environment.step(command)
         values = self._values(observation, info)
         success = _get(values, self._success, None)
-        if isinstance(success, Mapping | str) or np.size(success) != 1:  # whose truth is not that of a flag
+        if isinstance(success, Mapping | str) or np.asarray(success).size != 1:  # whose truth is not that of a flag
             raise UserError(f"task.success={self._success} must be a flag, and is of {type(success).__name__}")
         self.outcome = "success" if success else "failure" if terminated else "timeout"
         self.done = bool(success) or terminated or truncated
