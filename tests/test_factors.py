@@ -38,3 +38,17 @@ def test_a_draw_under_two_names_is_one_factor() -> None:
     draws: list[dict[str, Any]] = [{"pad": [0.1 * n, 0.2], "pads": [[0.1 * n, 0.2], [0.3, 0.1 * n]]} for n in range(8)]
     found = factors([Result(seed, "success", draws=each) for seed, each in enumerate(draws)])
     assert set(found) == {"pad", "pads[1]"}
+
+
+def test_words_that_all_differ_are_each_compared_with_few_others() -> None:
+    class Word(str):
+        compared = 0
+        __hash__ = str.__hash__
+
+        def __eq__(self, other: object) -> bool:
+            Word.compared += 1
+            return str.__eq__(self, other)
+
+    words = [Word(number % 1000) for number in range(2000)]
+    assert sorted(groups(words)) == [[number, number + 1000] for number in range(1000)]
+    assert Word.compared < 20_000

@@ -425,3 +425,15 @@ def test_a_recorded_world_says_what_contradicts_itself() -> None:
         Recorded(**{**made, "joints": "all"}, state=["x"], action=["x"], low=[0.0], high=[1.0])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="robot names s, o, m, e, which is not in the state"):
         Recorded(**{**made, "joints": "some"}, state=["x"], action=["x"], low=[0.0], high=[1.0])  # type: ignore[arg-type]
+
+
+def test_the_mean_action_of_a_million_steps_is_exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    actions, steps = np.full((2_000_000, 2), 0.7, np.float32), 100_000
+    entries = [
+        SimpleNamespace(seed=number, draws={}, span=slice(number * steps, (number + 1) * steps)) for number in range(20)
+    ]
+    store: Any = SimpleNamespace(episodes=entries, spec=None, folder="", rows=lambda name: actions)
+    options: Any = SimpleNamespace(collect=SimpleNamespace(more=None), evaluate=SimpleNamespace(episodes=1))
+    monkeypatch.setattr("vla.jobs.open_loop.open_loop", lambda *arguments: arguments[-1])
+    constant: Any = _measure(options, store, 0.3, None)
+    np.testing.assert_allclose(constant, 0.7, rtol=1e-6)

@@ -122,3 +122,9 @@ def test_draws_table_tells_ranges_and_words() -> None:
         "colour": ("blue, red", "red"),
         "blocks": ("2 … 3", "3"),
     }
+
+
+def test_a_picture_of_thousands_of_rows_is_no_longer_than_can_be_drawn(tmp_path: Path) -> None:
+    save(tmp_path / "sweep.png", {"success": lambda axes: None}, 1, (1, 700))
+    with Image.open(tmp_path / "sweep.png") as picture:
+        assert picture.height <= 2**16

@@ -13,7 +13,7 @@ from scipy.special import betaln
 
 from vla.parallel.pool import Cluster
 from vla.rollouts.comparison import Pairs, compare_pairs
-from vla.rollouts.evaluate import evaluate
+from vla.rollouts.evaluate import _Score, evaluate
 from vla.rollouts.results import Report, Result
 from vla.rollouts.sequential import anytime_difference, anytime_interval, anytime_p, excludes, is_decided, log_capital
 from vla.rollouts.statements import BarStatement, RunStatement
@@ -102,6 +102,15 @@ def test_tasks_that_take_turns_are_played_in_whole_rounds() -> None:
     assert report.episodes == 2
     tiers = {"easy": ["reach", "push", "pull"], "hard": ["stack"]}
     assert replace(report, tiers=tiers).mean_over_tiers is None
+
+
+@pytest.mark.parametrize(("turns", "last_gap"), [(1, 4), (3, 6)])
+def test_the_more_episodes_there_are_the_more_pass_before_they_are_counted_again(turns: int, last_gap: int) -> None:
+    seeds, counted = range(FIRST_SEED, FIRST_SEED + 4000), list[int]()
+    results = {seed: Result(seed, "success") for seed in seeds}
+    assert not _Score(seeds, results, lambda report: counted.append(len(report.results)) is not None, turns).advance()
+    gaps = np.diff([0, *counted])
+    assert (gaps[: 1000 // turns] == turns).all() and not (gaps % turns).any() and gaps[-1] == last_gap
 
 
 def test_a_run_is_compared_on_the_episodes_that_both_played() -> None:

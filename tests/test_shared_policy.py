@@ -8,6 +8,7 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from multiprocessing.shared_memory import SharedMemory
+from pathlib import Path
 from threading import Event
 from typing import Any
 from unittest.mock import Mock
@@ -115,6 +116,15 @@ def test_a_worker_is_answered_until_it_has_left_also_when_the_context_ends(monke
         with shared_policy(lambda: policy) as make_agent:
             action = worker.submit(late, make_agent(ToyEnvironment()))
         assert action.result().shape == (3,)
+
+
+def test_the_folder_for_temporary_files_may_have_a_long_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder := tmp_path / ("batch_job_" * 20)).mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    policy, seen = as_policy(make_bc()), SPEC.random_observation(np.random.default_rng(0))
+    with shared_policy(lambda: policy) as make_agent, closing(make_agent(ToyEnvironment())) as agent:
+        agent.reset(seen.instruction, 0)
+        assert agent.act(seen).shape == (3,)
 
 
 def test_a_worker_is_told_of_every_error_of_the_policy() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from vla.rollouts.comparison import SUCCESS, compare_samples
 from vla.rollouts.results import Report, Result
 from vla.rollouts.sequential import anytime_interval
 from vla.rollouts.statistics import pooled_interval
-from vla.run import SWEEP, _end
+from vla.run import SWEEP, _end, _fail
 from vla.runs.folder import read_run
 from vla.runs.sweep import SweepRow, describe_failures, read_rows, save_failure
 from vla.spec import FIRST_SEED
@@ -258,3 +259,30 @@ def test_a_cell_that_does_not_name_its_demonstrations_has_those_of_its_config(tm
     (tmp_path / "1/config.yaml").write_text("collect: {episodes: 500}")
     tabulate(tmp_path)
     assert (tmp_path / "sweep.html").exists() and (tmp_path / "sweep.png").exists()
+
+
+def test_the_error_of_a_cell_holds_neither_its_model_nor_its_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Model:
+        def __init__(self) -> None:
+            self.trainer = self  # as in a training, a cycle
+
+    def train() -> None:
+        model = Model()
+        models.append(weakref.ref(model))
+        try:
+            raise KeyError(model)
+        except KeyError as error:
+            raise UserError("the loss is not finite") from error
+
+    models = list[Any]()
+    config = OmegaConf.create({"runtime": {"output_dir": str(tmp_path / "0")}})
+    monkeypatch.setattr("vla.run.HydraConfig.get", lambda: config)
+    with pytest.raises(UserError, match="not finite") as kept:
+        try:
+            train()
+        except UserError as error:
+            _fail(error)
+    assert models[0]() is None and kept.value.__notes__ == [f"{SWEEP}{tmp_path}"]
+    assert (tmp_path / "0/error.txt").read_text() == "the loss is not finite\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import sys
 from functools import partial
@@ -10,6 +11,7 @@ from multiprocessing import active_children
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from collecting import until
@@ -113,3 +115,13 @@ def test_processes_that_crash_leave_no_file_open() -> None:
             pool.submit(number).exception()
             open_files.append(Process().num_fds())
     assert open_files[0] == open_files[2] == open_files[4]
+
+
+def test_many_workers_may_open_many_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = list[tuple[int, int]]()
+    monkeypatch.setattr(resource, "setrlimit", lambda _, pair: limits.append(pair))
+    for pair in ((1024, 524288), (1024, resource.RLIM_INFINITY), (1024, 4096), (20000, 20000), (1024, 1024)):
+        monkeypatch.setattr(resource, "getrlimit", lambda _, pair=pair: pair)
+        with ProcessPool(partial(Mock), 2):
+            pass
+    assert limits == [(8192, 524288), (8192, resource.RLIM_INFINITY), (4096, 4096)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import re
@@ -202,6 +203,9 @@ def _fail(error: Exception) -> NoReturn:
     bug = [*traceback.format_exception_only(error), *traceback.format_exception(error)]
     save_failure(cell, sentence(error) if _is_mendable(error) else "".join(bug))
     error.add_note(f"{SWEEP}{cell.parent}")
+    # Hydra keeps the errors of all cells until the sweep ends, and a traceback holds the model and data of its cell.
+    error.__cause__ = error.__context__ = error.__traceback__ = None
+    gc.collect()
     raise error
 
 

@@ -127,6 +127,6 @@ def _measure(experiment: Experiment, store: EpisodeStore, fraction: float, polic
     for training_store in (store, *map(EpisodeStore, experiment.collect.more or ())):
         entries, rows = training_store.episodes, training_store.rows("action")
         actions += [rows[entry.span] for entry in entries if not is_held_out(recording_of(entry), fraction)]
-    constant = np.concatenate(actions).mean(0)
+    constant = np.concatenate(actions).mean(0, dtype=np.float64)  # a sum of a million float32 is off by a percent
     held_out = track(parts[True][: experiment.evaluate.episodes], "evaluating")
     return open_loop(policy, store.spec, (episode_of(store, entry) for entry in held_out), constant)

@@ -19,7 +19,14 @@ from typing import Any, Literal
 from vla.io.errors import UserError
 from vla.io.types import Count
 from vla.parallel.limits import cores
-from vla.parallel.processes import ProcessEnded, Worker, WorkerFactory, WorkerProcess, one_thread_each
+from vla.parallel.processes import (
+    ProcessEnded,
+    Worker,
+    WorkerFactory,
+    WorkerProcess,
+    allow_many_files,
+    one_thread_each,
+)
 
 log = logging.getLogger(__name__)
 
@@ -99,6 +106,7 @@ class ProcessPool(AbstractContextManager["ProcessPool"]):
     """
 
     def __init__(self, make: WorkerFactory, size: int) -> None:
+        allow_many_files()
         self.size, self._make = size, pickle.dumps(make)
         self._lock = threading.Lock()
         self._processes: list[WorkerProcess] = []

@@ -7,12 +7,13 @@ import gc
 import logging
 import os
 import pickle
+import resource
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -20,6 +21,7 @@ from typing import Any, Protocol
 
 GPUS = "nvidiactl", "dxg", "kfd"  # devices of NVIDIA, the same in WSL, and of AMD
 SECONDS_TO_END = 5.0  # [s] for an idle process to free its resources
+MANY_FILES = 8192  # open files for a thousand workers, each of which takes six if they share a policy
 WORKER = "VLA_WORKER"  # environment variable: number of a worker process in its pool
 
 # LP_NUM_THREADS is read by Mesa's renderer, which does not count the calling thread.
@@ -167,6 +169,15 @@ def spin_briefly() -> None:
     spinning threads take these cores from the very threads that they wait for, in every operation.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # about ten microseconds
+
+
+def allow_many_files() -> None:
+    """Raise the limit of open files, usually 1024, to `MANY_FILES` or as far as the system permits."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MANY_FILES if hard == resource.RLIM_INFINITY else min(MANY_FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with suppress(OSError, ValueError):  # a system may permit less than it says
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 @contextmanager

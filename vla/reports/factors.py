@@ -56,7 +56,10 @@ def groups(values: Sequence[Any]) -> list[list[int]]:
         values = [str(quarter) for quarter in np.array(values) > np.median(values, axis=0)]
     levels = sorted(set(values), key=None if are_numeric(values) else str)
     if len(levels) <= BINS or not are_numeric(values):
-        return [[index for index, other in enumerate(values) if other == value] for value in levels]
+        indices = {value: list[int]() for value in levels}
+        for index, value in enumerate(values):
+            indices[value].append(index)
+        return [*indices.values()]
     return [group.tolist() for group in np.array_split(np.argsort(values, kind="stable"), BINS)]
 
 

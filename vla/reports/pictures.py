@@ -30,6 +30,7 @@ COLOURS = (GREEN, BLUE, RED, "#d9942b", "#8a5bb8", "#2f9fa3", "#b5628f", GREY)  
 INK = "#010203"  # black, and on a page the colour of its text
 MIDDLE = "#7a7f86"  # readable on white and on black, for PNG files on a page
 SIZE = (3.4, 2.3)  # of a panel [inch]
+DPI, LONGEST = 110, 65_000  # of a PNG file; its largest height or width, which Matplotlib 3.10 limits [px]
 
 
 def error_bars(rates: Iterable[Rate]) -> tuple[Array, Array]:
@@ -107,7 +108,8 @@ def save(
             axes.set_title(fill(name, int(14 * size[0])))
             draw(axes)
         with atomic_path(path) as draft:
-            figure.savefig(draft, format="png", dpi=110, transparent=ink != INK)
+            dpi = min(DPI, LONGEST / max(figure.get_size_inches()))
+            figure.savefig(draft, format="png", dpi=dpi, transparent=ink != INK)
 
 
 def svgs(panels: Panels) -> dict[str, Markup]:

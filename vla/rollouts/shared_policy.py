@@ -8,6 +8,7 @@ Shapes: k action chunk, D action components.
 
 from __future__ import annotations
 
+import os
 import queue
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,6 +19,7 @@ from itertools import count
 from multiprocessing import AuthenticationError
 from multiprocessing.connection import Client, Connection, Listener
 from multiprocessing.shared_memory import SharedMemory
+from tempfile import TemporaryDirectory, gettempdir
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -27,6 +29,7 @@ from vla.parallel.processes import make_picklable, one_thread_each
 from vla.spec import Agents, Array, Environment, Observation, RunningPlan, Spec
 
 MAX_WORKERS = 1024  # workers
+LONG_FOLDER = 60  # bytes of a path: that of a socket has at most 103, and folders of batch jobs are longer
 
 
 class Request(NamedTuple):
@@ -52,7 +55,12 @@ class _Planner(Agents, Protocol):
 @contextmanager
 def shared_policy(make_policy: Callable[[], _Planner]) -> Iterator[Callable[[Environment], _DistantPolicy]]:
     """Run a policy for all workers on this machine within the context; yield the factory of their agents."""
-    with one_thread_each(), Listener(family="AF_UNIX", authkey=(key := secrets.token_bytes(32))) as listener:
+    parent, key = "/tmp" if len(os.fsencode(gettempdir())) > LONG_FOLDER else None, secrets.token_bytes(32)
+    with (
+        one_thread_each(),
+        TemporaryDirectory(prefix="vla-", dir=parent) as folder,
+        Listener(f"{folder}/policy", "AF_UNIX", authkey=key) as listener,
+    ):
         policy, requests = make_policy(), queue.Queue[Request | None]()
         with (
             ThreadPoolExecutor(1) as server,
