@@ -171,7 +171,9 @@ def test_the_shell_stops_and_resumes_the_agent_and_when_that_is_killed_the_simul
     probe.until(lambda: probe.moved() < 1e-4)
     assert start("vla.deploy.say", "--resume", "put the blue block on the pad").wait(30) == 0
     probe.until(lambda: probe.moved() > 1e-3)
-    state = start("vla.deploy.say", "--state").printed(30)
+    for _ in range(5):  # on a busy machine an image may just be late
+        if "  state: running\n" in (state := start("vla.deploy.say", "--state").printed(30)):
+            break
     assert "  state: running\n" in state and "inference p50 [ms]: " in state
     assert start("vla.deploy.say", "--resume", "put the blue block on the pad").wait(30) == 0  # it is running already
     reset = start("vla.deploy.say", "--reset", "put the blue block on the pad")
