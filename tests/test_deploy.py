@@ -171,9 +171,7 @@ def test_the_shell_stops_and_resumes_the_agent_and_when_that_is_killed_the_simul
     probe.until(lambda: probe.moved() < 1e-4)
     assert start("vla.deploy.say", "--resume", "put the blue block on the pad").wait(30) == 0
     probe.until(lambda: probe.moved() > 1e-3)
-    for _ in range(5):  # on a busy machine an image may just be late
-        if "  state: running\n" in (state := start("vla.deploy.say", "--state").printed(30)):
-            break
+    state = start("vla.deploy.say", "--state").printed(30)
     assert "  state: running\n" in state and "inference p50 [ms]: " in state
     assert start("vla.deploy.say", "--resume", "put the blue block on the pad").wait(30) == 0  # it is running already
     reset = start("vla.deploy.say", "--reset", "put the blue block on the pad")
@@ -262,6 +260,21 @@ def test_a_loop_does_not_start_beside_nodes_that_it_would_take_for_its_own(name:
         require_alone(node)
     names.pop()
     require_alone(node)
+
+
+def test_the_state_that_is_told_is_the_newest_of_those_that_a_late_subscriber_gets(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    statuses = iter([SimpleNamespace(message=text, values=[]) for text in ("stopped", "holding", "running")])
+
+    def wait(operator: Operator, condition: Callable[[], bool], description: str) -> None:
+        while not condition():
+            operator.status = next(statuses, operator.status)  # type: ignore[assignment]
+
+    monkeypatch.setattr(Operator, "wait", wait)
+    operator = Operator.__new__(Operator)
+    operator.status = None
+    assert operator.describe() == "running"
 
 
 def test_without_a_simulator_to_reset_the_agent_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,14 +9,11 @@ import sys
 from collections.abc import Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import warm
 from command_line import SMALL
-
-from vla.jobs import JOBS
 
 ROOT = Path(__file__).parents[1]
 MODULES = {
@@ -184,11 +181,6 @@ main()
 def test_processes_do_not_import_what_they_do_not_use(module: str, library: str) -> None:
     code = f"import sys, {module}; sys.exit('{library}' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
-
-
-def test_jobs_that_save_their_config_say_so() -> None:
-    saving = {name for name in JOBS if "save_config(" in Path(find_spec(f"vla.jobs.{name}").origin).read_text()}  # type: ignore[union-attr]
-    assert saving == {name for name, job in JOBS.items() if job.saves_config}
 
 
 def test_only_worlds_of_mujoco_choose_its_backend_and_before_they_import_it() -> None:

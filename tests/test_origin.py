@@ -71,7 +71,7 @@ def test_differences_from_the_default_show_resolved_values() -> None:
     cfg = composed(
         "model.shift=[3,4]", "collect.episodes=7", "task.image_size=[64,64]", "output=there", "evaluate=suite"
     )
-    changes = {each["key"]: each for each in Experiment.from_config(cfg, composed()).changes}
+    changes = {each["key"]: each for each in Experiment.from_config(cfg, composed).changes}
     assert changes["model.shift"] == {"key": "model.shift", "here": [3, 4], "default": [12, 12]}
     assert changes["collect.episodes"]["here"] == 7
     tint = changes["evaluate.conditions.light_intensity_wide"]["here"]["randomize"]["light"]["tint"]
@@ -81,7 +81,7 @@ def test_differences_from_the_default_show_resolved_values() -> None:
 def test_settings_that_only_the_class_of_the_default_has_are_no_differences() -> None:
     changes = {
         each["key"]: each
-        for each in Experiment.from_config(composed("model/image=film_efficientnet"), composed()).changes
+        for each in Experiment.from_config(composed("model/image=film_efficientnet"), composed).changes
     }
     assert "model.image._target_" in changes and "-" not in [each["here"] for each in changes.values()]
 

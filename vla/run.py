@@ -11,6 +11,7 @@ import sys
 import traceback
 from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -162,13 +163,13 @@ def _run_job(cfg: DictConfig) -> float | None:
     trust(composed.get("trust"), [composed["job"], *targets(composed)], packages(composed))
     cfg = _merge_saved(cfg, overrides)
     job, option = jobs.find(cfg.job), HydraConfig.get().runtime.choices["job"]
-    default = compose("config", [f"job={option}"]) if job.saves_config else None
-    experiment = Experiment.from_config(cfg, default)
+    make_default = partial(compose, "config", [f"job={option}"])
+    experiment = Experiment.from_config(cfg, make_default)
     check(experiment, job)
     _require_sweepable(experiment, job.needs(experiment.nodes))
     if jobs.builds_world(experiment) and (replacements := substitutes(experiment["task"], overrides)):
         overrides += replacements
-        experiment = Experiment.from_config(_merge_saved(compose_again(*overrides), overrides), default)
+        experiment = Experiment.from_config(_merge_saved(compose_again(*overrides), overrides), make_default)
     return jobs.run(experiment)
 
 

@@ -32,7 +32,6 @@ class Job:
     without_agent: tuple[str, ...] = ()  # groups also needed without agent=OPTION
     without_checkpoint: tuple[str, ...] = ()  # groups also needed without agent=OPTION and checkpoint=RUN
     stored: tuple[str, ...] = ()  # groups whose libraries may be missing: a complete episode store takes their place
-    saves_config: bool = True  # and how it differs from the default, which takes a third of a second to find out
 
     def needs(self, config: Mapping[str, Any]) -> dict[str, Group]:
         """Return name → group for every group that the job builds from a config."""

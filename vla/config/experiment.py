@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial, reduce
 from operator import getitem
 from pathlib import Path
@@ -43,27 +43,18 @@ class Experiment:
     """A checked config. Its factories can be sent to worker processes, which inherit what is trusted."""
 
     nodes: Node  # plain, resolved
-    changes: list[Node] = field(default_factory=list)  # differences from the default config, to show
+    find_changes: Callable[[], list[Node]] = list
 
     @classmethod
-    def from_config(cls, cfg: DictConfig, default: DictConfig | None = None) -> Experiment:
-        """Create the experiment of a composed config; `default` is the config without overrides."""
+    def from_config(cls, cfg: DictConfig, make_default: Callable[[], DictConfig] | None = None) -> Experiment:
+        """Create the experiment of a composed config; `make_default` composes the config without overrides."""
         nodes = {group.name: None for group in GROUPS.values() if group.optional} | to_plain(cfg)
-        if default is None:
-            return cls(nodes)
-        default_nodes, changes = to_plain(default), []
-        # Unresolved, so that a value is one difference and not one in each place that refers to it.
-        unresolved, default_unresolved = (OmegaConf.to_container(config, resolve=False) for config in (cfg, default))
-        for key, raw, default_raw in differences(unresolved, default_unresolved):
-            if key.rpartition(".")[2] == SECRET or key.startswith("chosen."):  # the values of options are compared
-                continue
-            if raw == ABSENT and _class_differs(key, nodes, default_nodes):  # a setting of the default's class
-                continue
-            value, standard = value_at(nodes, key), value_at(default_nodes, key)
-            if value != standard or value == ABSENT:  # else a reference and a literal have the same value
-                own_value, default_value = value_at(nodes, key, raw), value_at(default_nodes, key, default_raw)
-                changes.append({"key": key, "here": own_value, "default": default_value})
-        return cls(nodes, _without_secrets(changes))
+        return cls(nodes, partial(_changes, cfg, nodes, make_default) if make_default else list)
+
+    @cached_property
+    def changes(self) -> list[Node]:
+        """Differences from the default config, to show; composed on first access, which takes a third of a second."""
+        return self.find_changes()
 
     @cached_property
     def config(self) -> Node:
@@ -254,6 +245,24 @@ class Experiment:
         episodes = {"episodes": self.collect.episodes, "more": self.collect.more or ()}
         spec = model.spec if model else store.spec
         return self.build("data", folder=store.folder, spec=spec, **windows, **episodes)
+
+
+def _changes(cfg: DictConfig, nodes: Node, make_default: Callable[[], DictConfig]) -> list[Node]:
+    """Return the differences of a config, with these plain nodes, from the default one."""
+    default, changes = make_default(), list[Node]()
+    default_nodes = to_plain(default)
+    # Unresolved, so that a value is one difference and not one in each place that refers to it.
+    unresolved, default_unresolved = (OmegaConf.to_container(config, resolve=False) for config in (cfg, default))
+    for key, raw, default_raw in differences(unresolved, default_unresolved):
+        if key.rpartition(".")[2] == SECRET or key.startswith("chosen."):  # the values of options are compared
+            continue
+        if raw == ABSENT and _class_differs(key, nodes, default_nodes):  # a setting of the default's class
+            continue
+        value, standard = value_at(nodes, key), value_at(default_nodes, key)
+        if value != standard or value == ABSENT:  # else a reference and a literal have the same value
+            own_value, default_value = value_at(nodes, key, raw), value_at(default_nodes, key, default_raw)
+            changes.append({"key": key, "here": own_value, "default": default_value})
+    return _without_secrets(changes)
 
 
 def _class_differs(key: str, nodes: Node, default_nodes: Node) -> bool:

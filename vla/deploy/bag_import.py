@@ -227,9 +227,6 @@ class BagDemonstrations(imported.ImportedDemonstrations):
     def __init__(self, folder: Path | str | None, topics: Topics, robot: JointLimits, *, spec: Spec) -> None:
         self.spec, self._limits = spec.without_truth, robot
         model = spec.require_robot("expert=bag")
-        if len(robot.joints) != len(model.joints):
-            counts = f"the task's robot has {len(model.joints)} joints, expert.robot has {len(robot.joints)}"
-            raise UserError(f"{counts}: choose another one with deploy/robot@expert.robot=OPTION")
         robot.require(model, "the task", "expert.robot")
         if missing := [camera for camera in spec.cameras if camera not in topics.images]:
             raise UserError(f"no topic for cameras {', '.join(missing)}: add +expert.topics.images.{missing[0]}=TOPIC")

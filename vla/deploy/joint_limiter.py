@@ -64,7 +64,8 @@ class JointLimits:
         """Raise a UserError unless an arm of these limits, at `key`, can be that of `owner`, a policy or a task."""
         if len(self.joints) != len(model.joints):
             raise UserError(
-                f"{owner} has {len(model.joints)} joints, the robot {len(self.joints)}: use another deploy/robot"
+                f"{owner} has {len(model.joints)} joints, the robot {len(self.joints)}: choose another option "
+                f"of deploy/robot for {key}"
             )
         for name, robot_name in zip(model.joints, self.joints, strict=True):
             if name != robot_name and name in self.joints:

@@ -102,6 +102,8 @@ class Operator:
     def describe(self) -> str:
         """Return the agent's status: its reason, then a line for each value."""
         self.wait(lambda: self.status is not None, f"a message on {AGENT}/status")
+        end = time.monotonic() + SETTLING_TIME  # a late subscriber gets the last ten one by one, the oldest first
+        self.wait(lambda: time.monotonic() > end, f"the newest message on {AGENT}/status")
         assert self.status is not None
         return "\n".join([self.status.message, *(f"  {name}: {value}" for name, value in self.values.items())])
 

@@ -26,7 +26,7 @@ def _plain_group(name: str, kind: str) -> Group:
 
 # Each is the module of that name, with a function `run`.
 JOBS = {
-    "collect": Job(("task", "expert", "cluster"), adopts=True, saves_config=False),
+    "collect": Job(("task", "expert", "cluster"), adopts=True),
     "train": Job(TRAINING, stored=("task", "expert")),
     "evaluate": Job(
         ("task", "cluster", "agent", "recorder"),
@@ -35,15 +35,13 @@ JOBS = {
         without_checkpoint=("expert", "data", "learner", "trainer", "logger"),
     ),
     "improve": Job((*TRAINING, "policy", "recorder", _plain_group("improve", "Rounds"))),
-    "deploy": Job(("tokenizer", "model", "policy", "agent", "deploy"), adopts=True, saves_config=False),
-    "export": Job(
-        ("task", "expert", "cluster", "tokenizer", "model", "policy", "export"), adopts=True, saves_config=False
-    ),
-    "inspect": Job((_plain_group("inspect", "Inspection"),), saves_config=False),
-    "preview": Job(("task", "expert", "recorder", _plain_group("preview", "Preview")), saves_config=False),
-    "report": Job((_plain_group("report", "ReportedRuns"),), saves_config=False),
-    "plan": Job((_plain_group("plan", "Power"),), saves_config=False),
-    "benchmark": Job((*TRAINING, "policy", _plain_group("benchmark", "Benchmark")), adopts=True, saves_config=False),
+    "deploy": Job(("tokenizer", "model", "policy", "agent", "deploy"), adopts=True),
+    "export": Job(("task", "expert", "cluster", "tokenizer", "model", "policy", "export"), adopts=True),
+    "inspect": Job((_plain_group("inspect", "Inspection"),)),
+    "preview": Job(("task", "expert", "recorder", _plain_group("preview", "Preview"))),
+    "report": Job((_plain_group("report", "ReportedRuns"),)),
+    "plan": Job((_plain_group("plan", "Power"),)),
+    "benchmark": Job((*TRAINING, "policy", _plain_group("benchmark", "Benchmark")), adopts=True),
 }
 
 

@@ -104,7 +104,7 @@ def evaluate_closed_loop(experiment: Experiment, checkpoint: Path | None) -> flo
             write_page(output)  # once more, because a kill or a full disk may have left none, or an older one
         return success
     statements, conclusions = _statements(experiment), list[str]()
-    _ = experiment.origin  # determine it now, before the code may change
+    _ = experiment.origin, experiment.changes  # determine them now, before the code may change
     try:
         with PlayedEpisodes(output, identity) as played:
             with agents_for_workers(experiment, checkpoint) as make_agent:

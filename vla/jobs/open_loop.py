@@ -40,7 +40,9 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
     UserError if the checkpoint was trained on other episodes, or on all of them.
     """
     output, folder = experiment.output, Path(experiment.collect.folder)
+    # Determined now, before the code may change.
     facts: dict[str, Any] = {**experiment.settings.chosen, "origin": asdict(experiment.origin)}
+    _ = experiment.changes
     fraction = _held_out_fraction(experiment, checkpoint)  # before an import
     has_store = checkpoint is not None and is_store(folder)  # else an earlier import is compared with its dataset
     store = EpisodeStore(folder, experiment.collect.episodes) if has_store else demonstrations(experiment)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import logging
 import pickle
 from collections.abc import Callable, Sequence
@@ -30,14 +29,6 @@ log = logging.getLogger(__name__)
 ROOM = 3  # memory of a process with a model, as a multiple of its weights: they arrive pickled, and the model acts
 GPU_PROCESS_MEMORY = 1e9  # of the GPU, and of the machine, that a process takes without its model [bytes]
 PER_WORKER = 5  # smallest number of episodes per process; fewer would take less time than its start
-
-
-class _WeightlessPickler(pickle.Pickler):
-    """Pickler that leaves out tensors, which would take time and memory."""
-
-    def reducer_override(self, value: Any) -> Any:
-        """Replace a tensor by a number."""
-        return (int, ()) if isinstance(value, torch.Tensor) else NotImplemented
 
 
 class ClosedLoop(Callback):
@@ -81,15 +72,15 @@ class ClosedLoop(Callback):
             self._pool = None
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Build the environment and pickle the model, but for its weights, before training, in case that fails."""
+        """Build the environment and pickle the model, as for every validation, before training, in case that fails."""
         assert isinstance(pl_module, Learner)
         self._enabled = pl_module.device_mesh is None and trainer.enable_validation
         if self._enabled:
             environment = self._make_environment()
             environment.close()
             pl_module.model.spec.require_input(environment.spec, "the demonstrations", "the task")
-            if min(self._workers, len(self._seeds) // PER_WORKER) > 1:  # else this process plays
-                _WeightlessPickler(io.BytesIO()).dump(pl_module.model)
+            if self._worker_count(pl_module, min(self._workers, len(self._seeds) // PER_WORKER)) > 1:
+                pickle.dumps(pl_module.model)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Play the episodes; later callbacks restore the weights in training."""
@@ -116,8 +107,7 @@ class ClosedLoop(Callback):
 
         At most as many worker processes play as have memory for a model each; if only one has, this process plays.
         """
-        size = sum(weight.nbytes for weight in learner.model.parameters())
-        workers = min(workers, processes_that_fit(learner.device, size))
+        workers = self._worker_count(learner, workers)
         with one_thread_each():
             if workers <= 1:
                 with learner.evaluating():
@@ -128,6 +118,12 @@ class ClosedLoop(Callback):
             parts = [seeds[worker::workers] for worker in range(workers)]
             futures = [self._pool.submit((model, part)) for part in parts]
             return [result for future, part in zip(futures, parts, strict=True) for result in _results(future, part)]
+
+    @staticmethod
+    def _worker_count(learner: Learner, most: int) -> int:
+        """Return how many workers, at most `most`, have memory for a model each."""
+        size = sum(weight.nbytes for weight in learner.model.parameters())
+        return min(most, processes_that_fit(learner.device, size))
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save `policy_best` if episodes were played, and their success rate is at least the best so far."""
