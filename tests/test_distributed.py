@@ -12,12 +12,14 @@ import toy
 import warm
 from command_line import SMALL, vla
 from defaults import defaults_of
+from lightning.pytorch.utilities import rank_zero_only
 from lightning_utilities.core.imports import RequirementCache
 from resuming import STOP, same
 from together import PAIRS, TRUNK, VLAS, composed, train, train_trunk, untrained
 from trunk import make_trunk_model
 
 from vla.config.experiment import make_policy
+from vla.jobs.train import train as train_policy
 from vla.models.learner import Learner
 from vla.models.policy_folder import POLICY
 from vla.runs.folder import LAST
@@ -119,6 +121,12 @@ def test_what_the_machine_lacks_is_said_before_anything_is_done(
     on = [] if overrides == ("trainer=fsdp",) else ["trainer.accelerator=cpu"]
     with pytest.raises(ValueError, match=f"is not available here .*{says}.* trainer=auto trainer.accelerator=auto"):
         make_trainer(composed("model=rt1_tiny", *overrides, *on).config, tmp_path)
+
+
+def test_one_device_has_no_other_process_than_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rank_zero_only, "rank", 1)  # as with RANK=1 left in the environment
+    with pytest.raises(ValueError, match=r"^RANK, .* is not the first process .* trainer\.devices=1 has only one"):
+        train_policy(composed("model=rt1_tiny", "trainer.accelerator=cpu", f"output={tmp_path}"))
 
 
 def test_what_lightning_refuses_is_not_blamed_on_the_machine(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from rich.table import Column
 log = logging.getLogger(__name__)
 
 LOG_INTERVAL = 60.0  # between two lines [s]
+SPEED_PERIOD = 600.0  # over which the remaining time is estimated: single episodes may take a minute [s]
 
 
 class Bar(Progress):
@@ -25,7 +26,7 @@ class Bar(Progress):
         count = MofNCompleteColumn(table_column=Column(no_wrap=True))  # so only the bar gives way to a long note
         columns = (TextColumn(label), BarColumn(bar_width=None), count, TextColumn("{task.description}"))
         # Painting takes milliseconds, in a thread that the work waits for.
-        super().__init__(*columns, TimeRemainingColumn(), refresh_per_second=4)
+        super().__init__(*columns, TimeRemainingColumn(), refresh_per_second=4, speed_estimate_period=SPEED_PERIOD)
         self._label, self._logged_at = label, time.monotonic()
         self.add_task(note, total=total, completed=done)
 

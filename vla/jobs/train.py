@@ -14,6 +14,7 @@ import lightning
 import torch
 from lightning import Callback, LightningModule, Trainer
 
+from vla.config.check import devices
 from vla.config.experiment import Experiment, training_policy
 from vla.data.datamodule import WindowDataModule, require_trainable
 from vla.data.episodes import EpisodeStore
@@ -63,6 +64,11 @@ def train(experiment: Experiment) -> Path | None:
     folder has another training, or this one cannot start.
     """
     output = experiment.output
+    if not first_process() and devices(experiment["trainer"]) == 1:
+        raise UserError(
+            "RANK, LOCAL_RANK or SLURM_PROCID says that this is not the first process of a training, but "
+            "trainer.devices=1 has only one: unset these environment variables, and start one task"
+        )
     last, policy = training_progress(output, experiment.config)
     if policy is not None:
         return policy if first_process() else None

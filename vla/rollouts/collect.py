@@ -173,9 +173,9 @@ def _fill(
                 store.fail(episode)
                 in_a_row[episode.task].append(episode.outcome)
                 _give_up_after(episode.task, in_a_row[episode.task])
-            speed = (len(store.episodes) - initial_count) / (time.monotonic() - start)
+            speed = 60 * (len(store.episodes) - initial_count) / (time.monotonic() - start)
             rate = outcomes[True] / outcomes.total()
-            bar.show(len(store.episodes), f"{speed:.1f} episodes/s, success {rate:.0%}")
+            bar.show(len(store.episodes), f"{speed:.0f} episodes/min, success {rate:.0%}")
 
 
 def _give_up_after(task: str, failures: Sequence[str]) -> None:
