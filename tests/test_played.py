@@ -87,29 +87,43 @@ def test_only_episodes_that_ended_in_an_error_are_played_again(tmp_path: Path, w
     assert reported(tmp_path / "run") == whole
 
 
+def interrupted(folder: Path, *arguments: str) -> str:
+    """What an evaluation says that is interrupted after each episode that it adds."""
+    add = PlayedEpisodes.add
+
+    def add_one(self: PlayedEpisodes, condition: str, result: Result) -> None:
+        add(self, condition, result)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PlayedEpisodes, "add", add_one)
+        done = here(folder, *COMMAND, *arguments, ok=False)
+    assert done.returncode == 130 and not done.stderr
+    return done.stdout
+
+
 def test_an_interrupted_evaluation_says_which_command_goes_on(tmp_path: Path, whole: dict[str, Any]) -> None:
-    def interrupted(*arguments: str) -> str:
-        """What it says after each episode that it adds."""
-        add = PlayedEpisodes.add
-
-        def add_one(self: PlayedEpisodes, condition: str, result: Result) -> None:
-            add(self, condition, result)
-            raise KeyboardInterrupt
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(PlayedEpisodes, "add", add_one)
-            done = here(tmp_path, *COMMAND, *arguments, ok=False)
-        assert done.returncode == 130 and not done.stderr
-        return done.stdout
-
-    first = interrupted()
+    first = interrupted(tmp_path)
     assert "already" not in first
     (folder,) = re.findall(r"^interrupted: the same command with (output=outputs/runs/.+) continues$", first, re.M)
-    second = interrupted(folder)
+    second = interrupted(tmp_path, folder)
     assert "episodes already played: 1, in" in second
     assert second.endswith("\ninterrupted: the same command continues\n")
     here(tmp_path, *COMMAND, folder)
     assert reported(tmp_path / folder.removeprefix("output="))["per_episode"] == whole["per_episode"]
+
+
+def test_more_episodes_and_other_conditions_use_what_was_played(tmp_path: Path, whole: dict[str, Any]) -> None:
+    interrupted(tmp_path, "output=run")
+    assert "played: 1, in" in interrupted(tmp_path, "output=run", f"evaluate.episodes={EPISODES + 1}")
+    assert "played: 2, in" in interrupted(tmp_path, "output=run", "++evaluate.conditions.short.time_limit=0.5")
+    file = tmp_path / "run" / RESULTS_FILE
+    *lines, last = file.read_text().splitlines(keepends=True)
+    assert '"never_reached"' in last
+    file.write_text("".join(lines) + last.replace('"never_reached"', '"success"'))
+    done = here(tmp_path, *COMMAND, "output=run")
+    assert "played: 3, in" in done.stdout + done.stderr
+    assert reported(tmp_path / "run") == whole  # without the episode of the shorter condition
 
 
 def play(folder: Path, head: dict[str, str], *seeds: int) -> dict[int, Result]:

@@ -6,6 +6,7 @@ In a world of recordings there is no success to measure, only errors of actions:
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
@@ -127,12 +128,19 @@ def evaluate_closed_loop(experiment: Experiment, checkpoint: Path | None) -> flo
 
 
 def _identity(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]:
-    """Return what determines the results of an evaluation."""
-    config = {name: node for name, node in experiment.config.items() if name not in IGNORED_KEYS}
+    """Return what determines the results of all conditions of an evaluation; other episodes and conditions do not."""
+    config = {name: node for name, node in experiment.config.items() if name not in (*IGNORED_KEYS, "evaluate")}
     weights = read_policy(checkpoint).training.weights if checkpoint else None
-    nearest = experiment.evaluate.nearest
-    replayed = hashlib.sha256((Path(nearest) / INDEX).read_bytes()).hexdigest() if nearest else None
-    return {"weights": weights, "versions": installed_versions(), "config": config, "replayed": replayed}
+    is_recorded = experiment.evaluate.recordings == "all"  # as it is played
+    return {"weights": weights, "versions": installed_versions(), "config": config, "recorded": is_recorded}
+
+
+def _condition_identity(options: Evaluation, name: str) -> str:
+    """Return what determines the results of a condition, apart from `_identity`."""
+    detail = options.changes.get(name) or options.networks.get(name)
+    if name == NEAREST:
+        detail = hashlib.sha256((Path(options.nearest or "") / INDEX).read_bytes()).hexdigest()
+    return json.dumps([name, detail])
 
 
 def agents_for_workers(experiment: Experiment, checkpoint: Path | None) -> AbstractContextManager[AgentFactory]:
@@ -193,13 +201,14 @@ def _play(
     until = (lambda report: all(statement.is_decided(report) for statement in statements)) if statements else None
     for number, (name, (make_environment, make_its_agent)) in enumerate(conditions.items(), 1):
         is_first = name == IN_DISTRIBUTION
-        label = "as configured" if is_first else name
+        label, identity = "as configured" if is_first else name, _condition_identity(options, name)
+        known_results = played.results[identity]
         reports[name] = play(
             *(make_environment, make_its_agent, make_recorder if is_first else None, seeds),
             name=f"{label} ({number} of {len(conditions)})" if len(conditions) > 1 else label,
             until=until if options.until else None,
-            known_results=played.results[name],
-            on_result=partial(played.add, name),
+            known_results={seed: known_results[seed] for seed in seeds if seed in known_results},
+            on_result=partial(played.add, identity),
         )
         if is_first:
             seeds = [result.seed for result in reports[name].results]

@@ -21,7 +21,7 @@ MAX_BYTES = 4 << 30  # of that file [bytes], millions of episodes
 
 log = logging.getLogger(__name__)
 
-Episode = tuple[str, Result]  # condition, result
+Episode = tuple[str, Result]  # condition with what determines its results, result
 
 
 class PlayedEpisodes(AbstractContextManager["PlayedEpisodes"]):
