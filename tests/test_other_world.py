@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import toy
+from command_line import here
 from composing import composed
 from defaults import defaults_of
 from exporting import exporter
@@ -131,3 +132,12 @@ def test_a_world_chooses_its_expert_and_evaluations_and_the_command_line_has_the
     assert own.task == {"_target_": "somewhere.World"} and own.validate.changes == {}
     assert "perturb" not in own.expert and [*own.evaluate.conditions] == ["wide"]
     assert "perturb" in said.expert and [*said.evaluate.conditions] == ["wide"]
+
+
+def test_a_variant_is_composed_with_the_folders_of_options_of_the_command(tmp_path: Path) -> None:
+    (tmp_path / "experiment").mkdir()
+    text = "# @package _global_\nvariants: {two: ['plan.rates=[0.6,0.6]']}\n"
+    (tmp_path / "experiment/own.yaml").write_text(text)
+    there = f"hydra.searchpath=[file://{tmp_path}]"
+    refused = here(tmp_path, "job=plan", there, "experiment=own", "variant=two", ok=False)
+    assert "plan.rates=[0.6, 0.6] are equal" in refused.stderr

@@ -40,8 +40,10 @@ def compose(*overrides: str) -> DictConfig:
 
     Add `output=DIR`: only the command line creates a folder per run.
     """
+    own = HydraConfig.get().overrides.hydra if HydraConfig.initialized() else []  # of the command
+    folders = [override for override in own if override.lstrip("+").startswith("hydra.searchpath=")]
     with _hydra():
-        config = hydra.compose("config", list(overrides), return_hydra_config=True)
+        config = hydra.compose("config", [*folders, *overrides], return_hydra_config=True)
     OmegaConf.resolve(config.chosen)  # needs Hydra's node
     with open_dict(config):
         del config["hydra"]
