@@ -31,8 +31,8 @@ class Controller:
         self._qpos = slice(joint.qposadr[0], joint.qposadr[0] + 7)
         self._arm = slice(joint.dofadr[0], joint.dofadr[0] + 7)
         self.site = model.site("gripper0_grip_site").id
-        self._motors = np.array([model.actuator(f"robot0_torq_j{number}").id for number in range(1, 8)])
-        self._fingers = np.array([model.actuator(f"gripper0_gripper_finger_joint{n}").id for n in (1, 2)])
+        motor, finger = (model.actuator(f"{name}1").id for name in ("robot0_torq_j", "gripper0_gripper_finger_joint"))
+        self._motors, self._fingers = slice(motor, motor + 7), slice(finger, finger + 2)
         self._low, self._high = model.actuator_ctrlrange[self._motors].T
         low, high = model.actuator_ctrlrange[self._fingers].T
         self._middle, self._half = (low + high) / 2, (high - low) / 2 * (1, -1)
@@ -55,7 +55,7 @@ class Controller:
 
     def step(self, data: mujoco.MjData, action: Array) -> None:
         """Apply an action (7,) of -1…1 for 50 ms: displacement and rotation vector in the world, gripper (1 closes)."""
-        move = np.clip(action[:6], -1, 1) * REACH
+        move, closing = np.clip(action[:6], -1, 1) * REACH, GRIPPER_RATE * float(np.sign(action[6]))
         for substep in range(SUBSTEPS):
             mujoco.mj_step1(self._model, data)
             state = self._home if self._unnoticed else data
@@ -65,8 +65,8 @@ class Controller:
                     self._rotation_goal = rotation(move[3:]) @ state.site_xmat[self.site].reshape(3, 3)
             torques = self._torques(state) + data.qfrc_bias[self._arm]
             self._unnoticed = False
-            data.ctrl[self._motors] = np.clip(torques, self._low, self._high)
-            self.opening = float(np.clip(self.opening - GRIPPER_RATE * np.sign(action[6]), -1, 1))
+            np.clip(torques, self._low, self._high, out=data.ctrl[self._motors])
+            self.opening = min(max(self.opening - closing, -1.0), 1.0)
             data.ctrl[self._fingers] = self._middle + self._half * self.opening
             mujoco.mj_step2(self._model, data)
 
