@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import pytest
 import torch
+from torch import nn
 
+from vla.models.compilation import prepare_compilation
 from vla.models.vision.image_tokenizer import FiLM, FilmConv, Keypoints, RandomShift, TokenLearner
 
 
@@ -133,3 +137,19 @@ def test_what_is_shifted_beyond_the_border_is_black() -> None:
     assert torch.equal(shifted[white].unique(), torch.tensor([255])) and (shifted[~white] == 0).all()
     assert torch.equal(white[:, 0], rows[:, :, None] & columns[:, None, :])  # a rectangle
     assert (rows.sum(1) < 32).sum() > 8 and (columns.sum(1) >= 16).all()
+
+
+def test_compiled_in_half_precision_it_has_the_same_gradients() -> None:
+    torch.manual_seed(0)
+    eager = nn.Sequential(nn.SiLU(), Keypoints(32, 16))
+    compiled = deepcopy(eager)
+    features = torch.randn(8, 32, 16, 16, dtype=torch.bfloat16).to(memory_format=torch.channels_last)
+    direction, gradients = torch.randn(8, 16, 34), list[torch.Tensor]()
+    prepare_compilation()
+    compiled.compile()
+    for model in (eager, compiled):
+        seen = features.clone().requires_grad_()
+        with torch.autocast("cpu", torch.bfloat16):
+            (model(seen) * direction).sum().backward()
+        gradients.append(torch.cat([each.grad.float().flatten() for each in (seen, *model.parameters())]))
+    assert (gradients[1] - gradients[0]).norm() < 0.03 * gradients[0].norm()

@@ -18,7 +18,7 @@ from torch._inductor.runtime.cache_dir_utils import default_cache_dir
 from toy import SPEC, ToyEnvironment
 
 from vla.io.types import Inherited
-from vla.models.compile_cache import set_compile_cache
+from vla.models.compilation import prepare_compilation
 from vla.models.flow import Flow
 from vla.models.layers import Batch, pixels
 from vla.models.model import Model, TokenModel
@@ -168,11 +168,11 @@ def test_what_is_compiled_is_kept_apart_by_processor(monkeypatch: pytest.MonkeyP
     for instructions in ("AVX2", "AVX512_CORE", "AVX2"):
         monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", default_cache_dir())  # as PyTorch does when it compiles
         monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", instructions)
-        set_compile_cache()
+        prepare_compilation()
         folders.add(os.environ["TORCHINDUCTOR_CACHE_DIR"])
     assert len(folders) == 3
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "chosen")
-    set_compile_cache()
+    prepare_compilation()
     assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == "chosen"
 
 

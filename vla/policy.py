@@ -20,7 +20,7 @@ from torch import Tensor
 from vla.io.errors import UserError
 from vla.io.types import Count
 from vla.models.chunking import Chunking, require_chunking
-from vla.models.compile_cache import set_compile_cache
+from vla.models.compilation import prepare_compilation
 from vla.models.layers import Batch
 from vla.models.model import Model
 from vla.schedule import Schedule
@@ -98,7 +98,7 @@ class Policy:
         self._encode, self._predict_chunk = self.model.encode, self.model.predict
         self._padding_sentences = [LONG_SENTENCE] if compile else []
         if compile:
-            set_compile_cache()
+            prepare_compilation()
             mode = "reduce-overhead" if self.device.type == "cuda" else None
             self._encode = torch.compile(self.model.encode, mode=mode)
             self._predict_chunk = torch.compile(self.model.predict, mode=mode)

@@ -17,7 +17,7 @@ from torchmetrics import MeanMetric
 from vla.io.errors import UserError
 from vla.io.printable import display_unit
 from vla.io.types import Natural, NonNegative, Positive, Rate
-from vla.models.compile_cache import set_compile_cache
+from vla.models.compilation import prepare_compilation
 from vla.models.fsdp import gather_weights, local_shard, shard
 from vla.models.layers import Batch
 from vla.models.lora import LoRA
@@ -94,7 +94,7 @@ class Learner(LightningModule):
     def configure_model(self) -> None:
         """Compile the model in place, which keeps names in checkpoints; shard it if the strategy has a device mesh."""
         if self._compile:
-            set_compile_cache()
+            prepare_compilation()
             self.model.compile()
             self._compile = False  # Lightning may call this hook again
         if self.device_mesh is not None:
