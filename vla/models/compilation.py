@@ -35,9 +35,9 @@ def _set_cache() -> None:
 def _limit_vectors() -> None:
     """Let PyTorch generate C++ without AVX-512, unless the compiler is Clang.
 
-    GCC 12.2 with -O3 miscompiles the generated transposes of 32 x 32 bfloat16 numbers: values in sums over the
-    transposed ones are never written, so that gradients of `bc` are wrong or not finite. With -fno-tree-slp-vectorize
-    they are right, but PyTorch takes no further options.
+    GCC 12.2 with -O3 miscompiles generated sums over transposed bfloat16 numbers for some processors, such as Intel's
+    Sapphire Rapids: gradients of `bc` are wrong or not finite. With -fno-tree-slp-vectorize they are right, but PyTorch
+    takes no further options.
     """
     from torch._inductor import config
 
