@@ -261,19 +261,39 @@ def test_a_knob_at_zero_is_not_off_and_the_planner_turns_it_further() -> None:
         solved(environment, FIRST_SEED)
 
 
-@pytest.mark.parametrize("name", ["goal 0", "object 3", "spatial 0"])  # a drawer, a bottle, a bowl by its rim
-def test_the_planner_solves(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("goal 0", 1),  # a drawer
+        ("object 3", 1),  # a bottle
+        ("spatial 0", 1),  # a bowl by its rim
+        ("long 0", 20),  # the second tin in a basket, while a finger stands on the basket's wall
+        ("long 1", 481),  # a flat box beside a carton
+        ("long 7", 297),  # a tin in a basket, off which the hand must turn
+        ("long 8", 88),  # pots by their handles
+    ],
+)
+def test_the_planner_solves(name: str, seed: int) -> None:
     with closing(world(name)) as environment, environment.blind():
-        solved(environment, 1)
+        solved(environment, seed)
 
 
-def solved(environment: Libero, seed: int) -> None:
+def solved(environment: Libero, seed: int) -> list[Array]:
+    """Check that the planner solves an episode; return its actions."""
     expert, other = Planner(spec=environment.spec), Planner(spec=environment.spec)
-    seen = environment.reset(seed)
+    seen, actions = environment.reset(seed), list[Array]()
     while not environment.done:
-        seen = environment.step(expert.act(seen))
+        actions.append(expert.act(seen))
+        seen = environment.step(actions[-1])
     assert environment.outcome == "success"
     assert np.array_equal(expert.act(seen), other.act(seen))  # which saw nothing of what was before
+    return actions
+
+
+def test_fingers_that_begin_to_let_go_open_all_the_way() -> None:
+    with closing(world("long 4")) as environment, environment.blind():
+        is_open = np.array(solved(environment, 14))[:, 6] > 0
+    assert np.flatnonzero(np.diff(is_open)).size == 4  # two mugs, each of which is grasped and let go
 
 
 def test_no_millimetre_decides_whether_the_hand_goes_up_or_down() -> None:

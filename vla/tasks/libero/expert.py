@@ -6,6 +6,7 @@ read from the goal's predicates; where to grasp is computed from collision geome
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,17 +14,31 @@ import numpy as np
 from vla.io.errors import UserError
 from vla.spec import Array, Observation, Spec
 from vla.tasks.libero.environment import STATE, action_of
-from vla.tasks.libero.goal import CABINET
+from vla.tasks.libero.goal import CABINET, Predicate
 from vla.tasks.libero.grasps import choose_grasp, room_of
 from vla.tasks.libero.package import ALL, tasks_of
 from vla.tasks.libero.places import place_of, way_off_drawer_path
 from vla.tasks.libero.situation import HELD, THIN, Situation
-from vla.tasks.libero.skills import TWIST, approach, carry, command, drag, let_go, pull, push, twist, withdraw
+from vla.tasks.libero.skills import (
+    TWIST,
+    approach,
+    back_off,
+    carry,
+    command,
+    drag,
+    is_over,
+    let_go,
+    pull,
+    push,
+    twist,
+    withdraw,
+)
 
 DRAWERS = ("wooden_cabinet", "white_cabinet", "yellow_cabinet")  # what must be open for something to be put in
 HOLLOWS = (*DRAWERS, "microwave")  # into which things are brought all the way
 SLIPPED = 0.03  # by how much a drawer may close while a thing is brought into it, before the thing is let go [m]
 ARRIVED = 0.015  # distance from its place at which a thing is all the way in [m]
+LOOSENED = 0.5  # commanded opening at which fingers no longer drag along what they let go
 NARROW = 0.006  # free room around the hand below which a thing under another one is first dragged out [m]
 
 
@@ -66,6 +81,8 @@ def decide(situation: Situation) -> Array:
         return _open_fingers(situation)
     if touched_thing is not None and all(situation.subject(part.thing) != touched_thing for part in todo):
         return _release(situation, held_thing)
+    if held_thing is None and _is_put_down(situation, todo):
+        return _open_fingers(situation) if situation.opening < LOOSENED else back_off(situation)
     name, thing, place = next((part for part in todo if part.thing == held_thing), todo[0])
     if name in ("on", "in") and _is_shut(situation, place, SLIPPED if thing == held_thing else 0.0):
         if thing == held_thing:  # the hand is needed to open the drawer
@@ -89,6 +106,15 @@ def decide(situation: Situation) -> Array:
 
 def _open_fingers(situation: Situation) -> Array:
     return command(situation, situation.hand, situation.yaw, -1.0, situation.lean)
+
+
+def _is_put_down(situation: Situation, todo: Sequence[Predicate]) -> bool:
+    """Return whether what is between the fingers needs nothing more, or is falling to its place."""
+    thing = situation.enclosed_thing()
+    part = next((part for part in todo if situation.subject(part.thing) == thing), None)
+    if thing is None or part is None:
+        return thing is not None
+    return part.name in ("on", "in") and is_over(situation, thing, place_of(situation, thing, part.place, True))
 
 
 def _release(situation: Situation, thing: str | None) -> Array:

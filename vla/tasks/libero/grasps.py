@@ -5,25 +5,30 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
 from vla.robots.cartesian import rotation_z
 from vla.spec import Array
 from vla.tasks.libero.places import Place
-from vla.tasks.libero.room import CLEAR, HAND, PALM, TIP, axes, clearance, reach_costs
-from vla.tasks.libero.situation import THIN, Situation
+from vla.tasks.libero.room import CLEAR, HAND, axes, clearance, reach_costs
+from vla.tasks.libero.situation import FINGER, PALM, THIN, TIP, Situation
 
 WIDEST = 0.074  # of a thing between the open fingers [m]
 RIM = 0.012  # depth of a grasp below the edge of a wall [m]
 SHIFTS = ((0.01, 0.004), (0.03, -0.014))  # cost and offset of such a grasp towards the inside [m]
-FINGER, OPEN, THICK = 0.012, 0.037, 0.02  # half of a finger's breadth, its distance from the middle, its depth [m]
+SIDEWAYS = ((0.0, 0.0), (0.02, 0.025), (0.02, -0.025))  # cost and offset from the middle of a grasp of a long thing [m]
+LONG = 0.45  # largest distance from the middle of a long thing at which a finger holds it, relative to its length
+OPEN, THICK = 0.037, 0.02  # distance of an open finger from the middle, and its depth [m]
 RIDGE = 0.02  # radius of what counts as the highest part of a thing [m]
 UPRIGHT = 0.9  # least cosine of the tilt of a thing that stands
 TOUCHING = 0.02  # room at which the hand most likely hits something [m]
 SQUARE = 0.9  # least cosine between the direction in which the fingers close and the normal of a wall
 KINDS = (0.0, 0.08, 0.10, 0.12)  # costs of grasps across a thing, by a wall, by a narrow part and leaning
 LEAN = 0.45  # of the hand where something stands in its way [rad]
+OBLIQUE = 0.003  # largest excess of the width of a part over its smallest one [m]
+WRIST = 0.3  # height over its grasp at which the wrist of a leaning hand still is while it comes down [m]
 YAWS = np.radians(np.arange(-90, 90, 15))
 
 
@@ -34,6 +39,7 @@ class Grasp:
     position: Array  # (3,) of the point between the fingertips [m]
     yaw: float  # of the fingers, 0: they close along y [rad]
     lean: float = 0.0  # of the hand about the axis along which the fingers close [rad]
+    swing: float = 0.0  # of the arm about its base, with the thing [rad]
 
 
 def choose_grasp(situation: Situation, thing: str, place: Place) -> Grasp | None:
@@ -60,7 +66,7 @@ def choose_grasp(situation: Situation, thing: str, place: Place) -> Grasp | None
         if costs[index] < lowest_cost:
             best_grasp, lowest_cost = grasps[index], float(costs[index])
             hindrance = float(base_cost + hindrances[index])
-    return best_grasp
+    return best_grasp and replace(best_grasp, swing=situation.swing(best_grasp.position, place.spot))
 
 
 def room_of(situation: Situation, thing: str, grasp: Grasp) -> float:
@@ -74,7 +80,8 @@ def _costs(situation: Situation, thing: str, grasps: Sequence[Grasp], place: Pla
     spots = np.array([grasp.position for grasp in grasps])
     yaws, leans = np.array([grasp.yaw for grasp in grasps]), np.array([grasp.lean for grasp in grasps])
     targets = place.spot + (spots - situation.origin(thing)) @ rotation_z(place.turn).T
-    turns = np.array([situation.turn_to(yaw) for yaw in yaws])
+    swing = situation.swing(situation.origin(thing), place.spot)
+    turns = np.array([situation.turn_to(yaw, swing) for yaw in yaws])
     # What is near the hand costs less: the choice stays the same while the hand approaches.
     distance = np.minimum(np.linalg.norm(spots[:, :2] - situation.hand[:2], axis=1), HAND)
     moves = 0.02 * np.abs(turns) + 0.02 * np.abs(leans - situation.lean) + 0.5 * distance + 0.01 * np.abs(yaws)
@@ -89,7 +96,9 @@ def _hindrances(situation: Situation, thing: str, spots: Array, yaws: Array, lea
     middle = (spots.max(axis=0) + spots.min(axis=0)) / 2
     obstacles = situation.surroundings(thing, middle, float(np.ptp(spots[:, :2], axis=0).max()) / 2 + HAND + CLEAR)
     gaps = clearance(spots, yaws, obstacles, leans)
-    return 3 * np.maximum(0, CLEAR - gaps) + 10 * np.maximum(0, TOUCHING - gaps) + reach_costs(situation, spots)
+    wrists = spots.copy()
+    wrists[:, :2] -= WRIST * np.tan(leans)[:, None] * np.column_stack([np.cos(yaws), np.sin(yaws)])
+    return 3 * np.maximum(0, CLEAR - gaps) + 10 * np.maximum(0, TOUCHING - gaps) + reach_costs(situation, wrists)
 
 
 def grasps_across(points: Array) -> Iterator[tuple[float, Grasp]]:
@@ -101,9 +110,14 @@ def grasps_across(points: Array) -> Iterator[tuple[float, Grasp]]:
     for yaw in YAWS:
         closing, cross_axis = axes(yaw)
         widths, lengths = ring[:, :2] @ closing, ring[:, :2] @ cross_axis
-        if np.ptp(widths) <= WIDEST:
-            middle = closing * (widths.max() + widths.min()) / 2 + cross_axis * (lengths.max() + lengths.min()) / 2
-            yield float(np.ptp(widths)), Grasp(np.array([*middle, height]), float(yaw))
+        if np.ptp(widths) > WIDEST:
+            continue
+        centre = (lengths.max() + lengths.min()) / 2
+        for cost, shift in SIDEWAYS:
+            if shift and abs(shift) + FINGER > LONG * np.ptp(lengths):
+                break
+            middle = closing * (widths.max() + widths.min()) / 2 + cross_axis * (centre + shift)
+            yield cost + float(np.ptp(widths)), Grasp(np.array([*middle, height]), float(yaw))
 
 
 def crest(points: Array) -> Iterator[tuple[float, Grasp]]:
@@ -133,8 +147,10 @@ def walls(points: Array) -> Iterator[tuple[float, Grasp]]:
 
 
 def leaning_grasps(points: Array) -> Iterator[tuple[float, Grasp]]:
-    """Yield width [m] and grasp of a wall with a hand that leans to a side."""
-    for width, grasp in walls(points):
+    """Yield width [m] and grasp of a wall, or across a whole thing, with a hand that leans to a side."""
+    corner = np.array([0.0, 0.0, FINGER * np.sin(LEAN)])  # depth of the lower corner of a leaning fingertip
+    across = ((width, replace(grasp, position=grasp.position + corner)) for width, grasp in grasps_across(points))
+    for width, grasp in chain(walls(points), across):
         for lean in (-LEAN, LEAN):
             yield width, replace(grasp, lean=lean)
 
@@ -151,13 +167,17 @@ def parts(pieces: Sequence[Array], alone: bool = True) -> Iterator[tuple[float, 
         if height > points[:, 2].max() - 0.004:
             continue
         middle = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
+        options = []
         for yaw in YAWS:
             closing, cross_axis = axes(yaw)
             width = float(np.ptp(points[:, :2] @ closing))
             band = cloud[(np.abs((cloud[:, :2] - middle) @ cross_axis) < FINGER) & (cloud[:, 2] > height - TIP)]
             offsets = np.abs((band[:, :2] - middle) @ closing)
             if width < WIDEST / 2 and not (alone and offsets[offsets < OPEN].max(initial=0.0) > width / 2 + THIN):
-                yield width, Grasp(np.array([*middle, height]), float(yaw))
+                options.append((width, Grasp(np.array([*middle, height]), float(yaw))))
+        # Fingers that close obliquely turn a narrow part, and the thing with it.
+        narrowest = min((width for width, _ in options), default=0.0)
+        yield from (option for option in options if option[0] < narrowest + OBLIQUE)
 
 
 def gap_of(grasp: Grasp, points: Array) -> float:

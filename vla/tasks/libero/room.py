@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from vla.spec import Array
-from vla.tasks.libero.situation import Situation
+from vla.tasks.libero.situation import PALM, Situation
 
-PALM = 0.030  # largest height of a thing above the point between the fingertips [m]
-TIP = 0.012  # of the fingers below that point [m]
 HAND = 0.10  # half of the width of the hand over the fingers [m]
 CLEAR = 0.045  # distance between a finger or the hand and anything else [m]
 ARM = (0.34, 0.75)  # horizontal distances from the base between which the arm neither folds up nor stretches [m]

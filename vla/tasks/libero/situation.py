@@ -23,6 +23,9 @@ THIN = 0.003  # least distance of fingers that hold something [m]
 WRIST = 2.7  # largest turn of the last joint either way, whose limit is 2.9 [rad]
 SMALL = 0.2  # turn that is executed at any position of the last joint [rad]
 SLANT = 0.3  # largest vertical component of the direction in which the fingers of an upright hand close
+PALM = 0.030  # largest height of a thing above the point between the fingertips [m]
+TIP = 0.012  # of the fingers below that point [m]
+FINGER = 0.012  # half of a finger's breadth [m]
 UPRIGHT = -0.6  # largest vertical component of the direction in which an upright hand points
 
 
@@ -66,15 +69,20 @@ class Situation:
         """Whether the hand points down, possibly leaning, with fingers that close horizontally."""
         return bool(self.rotation[2, 2] < UPRIGHT and abs(self.rotation[2, 0]) < SLANT)
 
-    def turn_to(self, yaw: float) -> float:
+    def turn_to(self, yaw: float, swing: float = 0.0) -> float:
         """Return the rotation [rad] to a yaw: the fingers are alike, so half a turn more or less is the same.
 
-        The last joint turns against the yaw and must stay off its limits.
+        The last joint turns against the yaw, and then with the arm by its `swing` [rad], and must stay off its limits.
         """
         turns = yaw - self.yaw + np.pi * np.arange(-3, 4)
         wrist = self.data.qpos[6] - turns
-        strained = (np.abs(wrist) > WRIST) & (np.abs(turns) > SMALL)
+        strained = (np.maximum(np.abs(wrist), np.abs(wrist + swing)) > WRIST) & (np.abs(turns) > SMALL)
         return float(turns[int(np.lexsort((np.abs(turns), strained))[0])])
+
+    def swing(self, start: Array, goal: Array) -> float:
+        """Return the angle [rad] by which the arm turns about its base from a place (3,) to another one [m]."""
+        angles = [np.arctan2(*(place - self.base)[1::-1]) for place in (start, goal)]
+        return float(angles[1] - angles[0])
 
     def origin(self, thing: str) -> Array:
         """Return the origin (3,) of a thing [m]."""
@@ -130,12 +138,22 @@ class Situation:
         held = contacts[0] | contacts[1] if is_shut else contacts[0] & contacts[1]
         return next((name for name, body in self.goal.bodies.items() if body in held and body in self._movable), None)
 
+    def enclosed_thing(self) -> str | None:
+        """Return the movable thing of which a part is between the fingers."""
+        for name, body in self.goal.bodies.items():
+            if body in self._movable:
+                closing, across, ahead = ((self.points(name) - self.hand) @ self.rotation).T
+                between = (np.abs(closing) < self.gap / 2 + THIN) & (np.abs(across) < FINGER)
+                if (between & (ahead > -PALM) & (ahead < 0)).any():
+                    return name
+        return None
+
     def rests(self, thing: str) -> bool:
-        """Return whether a thing touches another one that can be moved."""
+        """Return whether a held thing, or a finger, touches another thing that can be moved."""
         root, pairs = self.goal.bodies[thing], self.model.geom_bodyid[self.data.contact.geom[: self.data.ncon]]
         owners = self.goal.owner[pairs]
-        neighbours = owners[(owners == root).any(axis=1)].ravel()
-        return bool(np.isin(neighbours, list(self._movable - {root})).any())
+        is_held = (owners == root) | np.isin(pairs, [body for finger in self._fingers for body in finger])
+        return bool(np.isin(owners[is_held.any(axis=1)], list(self._movable - {root})).any())
 
     def _place(self, thing: str, body: int) -> list[Array]:
         """Return points (N, 3) on each geom of a body [m], which are cached until the body moves."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 
@@ -9,8 +11,8 @@ from vla.spec import Array
 from vla.tasks.libero.controller import REACH
 from vla.tasks.libero.grasps import LEAN, TOUCHING, Grasp, gap_of, parts, room_of
 from vla.tasks.libero.places import LOOSE, Place
-from vla.tasks.libero.room import HAND, TIP, axes
-from vla.tasks.libero.situation import THIN, Situation
+from vla.tasks.libero.room import HAND, axes
+from vla.tasks.libero.situation import SHUT, THIN, TIP, Situation
 
 GAIN = 3.0  # on the remaining distance, in a command: with less, the hand stops a centimetre short of its target
 TURN_GAIN = 1.0  # on the remaining rotation: more is unstable where the arm folds up
@@ -27,7 +29,9 @@ SLOW = 0.012  # lead of the hand over what it drags; with more, it slips [m]
 BACK = 0.5  # lean of a hand that pushes [rad]
 EMPTY = 0.01  # largest distance between fingers that hold nothing of use [m]
 STRAIGHT = 0.97  # least cosine of the tilt of a thing that is let go
-RESTS = 0.12  # height over its place at which a thing is let go if it lies on something there [m]
+# Height over its place at which a thing is let go if it, or a finger, lies on something there, and horizontal distance,
+# where there is little room or much [m].
+RESTS, FALLS = 0.12, (0.02, 0.03)
 TWIST = 0.4  # lead of the hand over a knob that it turns [rad]
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -43,11 +47,11 @@ def approach(situation: Situation, grasp: Grasp, points: Array, thing: str, open
     height = situation.hand[2] - grasp.position[2]
     offset = (situation.hand - grasp.position - max(height, 0.0) * slope) * (1, 1, 0)
     distance = float(np.hypot(*offset[:2]))
-    turn = max(abs(situation.turn_to(grasp.yaw)), abs(situation.lean - grasp.lean))
+    turn = max(abs(grasp.yaw - situation.yaw), abs(situation.lean - grasp.lean))
     # Fingers that have begun to close go on unless the hand is far off.
     factor = 1.0 if situation.opening > 0.5 else 1.6
     if distance < factor * NEAR and turn < factor * TURNED and abs(height) < factor * LEVEL:
-        return command(situation, grasp.position, grasp.yaw, 1.0, grasp.lean)
+        return command(situation, grasp.position, grasp.yaw, 1.0, grasp.lean, grasp.swing)
     obstacles = situation.surroundings(thing, grasp.position, HAND)
     # Heights of the hand at which its fingers are above the thing, and above what stands about.
     thing_top, obstacle_top = (cloud[:, 2].max(initial=-np.inf) + TIP + MARGIN for cloud in (points, obstacles))
@@ -63,7 +67,7 @@ def approach(situation: Situation, grasp: Grasp, points: Array, thing: str, open
     obstacle_height = lowest(situation, obstacle_top + _funnel(-obstacle_room), obstacle_room)
     rise = max(0.0, thing_height - grasp.position[2], obstacle_height - grasp.position[2])
     target = grasp.position + rise * slope
-    return command(situation, rising_target(situation, target), grasp.yaw, opening, grasp.lean)
+    return command(situation, rising_target(situation, target), grasp.yaw, opening, grasp.lean, grasp.swing)
 
 
 def lowest(situation: Situation, top: float, room: float) -> float:
@@ -95,17 +99,22 @@ def carry(situation: Situation, thing: str, place: Place) -> Array:
             return command(situation, situation.hand + place.spot - origin, yaw, 1.0, lean)
     offset = place.spot - origin
     distance = float(np.hypot(*offset[:2]))
-    rests = offset[2] > -RESTS and place.slack == LOOSE and situation.rests(thing)
-    if distance < (0.03 if rests else min(0.015, place.slack)) and abs(place.turn) < TURNED:
-        if rests:
-            return command(situation, situation.hand, yaw, -1.0, lean)
-        if offset[2] > -0.012:
-            return let_go(situation, thing)
+    if is_over(situation, thing, place) and (situation.opening > SHUT or situation.rests(thing)):
+        return command(situation, situation.hand, yaw, -1.0, lean)
+    if distance < min(0.015, place.slack) and abs(place.turn) < TURNED and offset[2] > -0.012:
+        return let_go(situation, thing)
     distance += 0.1 * abs(place.turn)
     target = situation.hand + offset + np.clip(FUNNEL * (distance - 0.6 * place.slack), 0.0, CARRY) * UP
     pass_height = target[2] + max(0.0, _pass_height(situation, thing, place.spot))  # height over all that is on the way
     target[2] = max(target[2], lowest(situation, pass_height, max(place.slack, 0.015) - distance))
     return command(situation, rising_target(situation, target), yaw, 1.0, lean)
+
+
+def is_over(situation: Situation, thing: str, place: Place) -> bool:
+    """Return whether a thing would fall to its place."""
+    offset = place.spot - situation.origin(thing)
+    distance = float(np.hypot(*offset[:2]))
+    return bool(offset[2] > -RESTS and distance < FALLS[place.slack == LOOSE] and abs(place.turn) < TURNED)
 
 
 def let_go(situation: Situation, thing: str) -> Array:
@@ -123,9 +132,9 @@ def let_go(situation: Situation, thing: str) -> Array:
 
 def equivalent_grasp(situation: Situation, grasp: Grasp) -> Grasp:
     """Return the grasp, equal up to a swap of the fingers, that the hand reaches by the smallest turn."""
-    turn = situation.turn_to(grasp.yaw)
+    turn = situation.turn_to(grasp.yaw, grasp.swing)
     same = np.cos(situation.yaw + turn - grasp.yaw) > 0
-    return Grasp(grasp.position, situation.yaw + turn, grasp.lean if same else -grasp.lean)
+    return replace(grasp, yaw=situation.yaw + turn, lean=grasp.lean if same else -grasp.lean)
 
 
 def _pass_height(situation: Situation, thing: str, spot: Array) -> float:
@@ -232,19 +241,25 @@ def push(situation: Situation, thing: str) -> Array:
 
 
 def closing_command(situation: Situation, top: float) -> float:
-    """Return the gripper command: close, unless the open fingers could close on something below height `top` [m]."""
-    return 1.0 if situation.gap < EMPTY or situation.hand[2] > top + TIP else -1.0
+    """Return the gripper command: close, unless the fingers could close on something below height `top` [m]."""
+    are_closed = situation.gap < EMPTY and situation.enclosed_thing() is None
+    return 1.0 if are_closed or situation.hand[2] > top + TIP else -1.0
 
 
 def withdraw(situation: Situation) -> Array:
     """Retract a hand that does not point down, opposite to where it points, then turn it down."""
     obstacles = situation.surroundings("", situation.hand, 0.1)
     if len(obstacles) and np.linalg.norm(obstacles - situation.hand, axis=1).min() < 0.09:
-        return move(situation, situation.hand - 0.05 * situation.rotation[:, 2], situation.rotation, -1.0)
+        return back_off(situation)
     inwards = situation.base - situation.hand  # so that the arm is not stretched
     return command(
         situation, situation.hand + np.array([*(0.05 * inwards[:2] / np.hypot(*inwards[:2])), 0.02]), 0.0, -1.0
     )
+
+
+def back_off(situation: Situation) -> Array:
+    """Retract the open hand opposite to where it points."""
+    return move(situation, situation.hand - 0.05 * situation.rotation[:, 2], situation.rotation, -1.0)
 
 
 def tops(situation: Situation) -> float:
@@ -260,9 +275,14 @@ def rising_target(situation: Situation, target: Array) -> Array:
     return target
 
 
-def command(situation: Situation, target: Array, yaw: float, grip: float, lean: float = 0.0) -> Array:
-    """Return the command that moves the hand, pointing down, towards a position, a yaw and a lean."""
-    yaw = situation.yaw + situation.turn_to(yaw)
+def command(
+    situation: Situation, target: Array, yaw: float, grip: float, lean: float = 0.0, swing: float = 0.0
+) -> Array:
+    """Return the command that moves the hand, pointing down, towards a position, a yaw and a lean.
+
+    `swing`: of the arm afterwards [rad], as of a `Grasp`.
+    """
+    yaw = situation.yaw + situation.turn_to(yaw, swing)
     closing_axis, cross_axis = (np.array([*axis, 0.0]) for axis in axes(yaw))
     direction = np.sin(lean) * cross_axis - np.cos(lean) * UP
     return move(situation, target, np.stack([closing_axis, np.cross(direction, closing_axis), direction], axis=1), grip)
