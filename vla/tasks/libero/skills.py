@@ -29,9 +29,8 @@ SLOW = 0.012  # lead of the hand over what it drags; with more, it slips [m]
 BACK = 0.5  # lean of a hand that pushes [rad]
 EMPTY = 0.01  # largest distance between fingers that hold nothing of use [m]
 STRAIGHT = 0.97  # least cosine of the tilt of a thing that is let go
-# Height over its place at which a thing is let go if it, or a finger, lies on something there, and horizontal distance,
-# where there is little room or much [m].
-RESTS, FALLS = 0.12, (0.02, 0.03)
+RESTS = 0.12  # height over its place at which a thing is let go if it, or a finger, lies on something there [m]
+FALLS, SLIPS = 0.03, 0.02  # horizontal distance at which it is, where there is room for it, and where there is none [m]
 TWIST = 0.4  # lead of the hand over a knob that it turns [rad]
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -113,8 +112,8 @@ def carry(situation: Situation, thing: str, place: Place) -> Array:
 def is_over(situation: Situation, thing: str, place: Place) -> bool:
     """Return whether a thing would fall to its place."""
     offset = place.spot - situation.origin(thing)
-    distance = float(np.hypot(*offset[:2]))
-    return bool(offset[2] > -RESTS and distance < FALLS[place.slack == LOOSE] and abs(place.turn) < TURNED)
+    is_near = np.hypot(*offset[:2]) < (FALLS if place.slack == LOOSE else SLIPS)
+    return bool(is_near and offset[2] > -RESTS and abs(place.turn) < TURNED)
 
 
 def let_go(situation: Situation, thing: str) -> Array:
