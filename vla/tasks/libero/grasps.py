@@ -28,7 +28,7 @@ SQUARE = 0.9  # least cosine between the direction in which the fingers close an
 KINDS = (0.0, 0.08, 0.10, 0.12)  # costs of grasps across a thing, by a wall, by a narrow part and leaning
 LEAN = 0.45  # of the hand where something stands in its way [rad]
 OBLIQUE = 0.003  # largest excess of the width of a part over its smallest one [m]
-WRIST = 0.3  # height over its grasp at which the wrist of a leaning hand still is while it comes down [m]
+DESCENT = 0.3  # height of the wrist over a grasp at which a leaning hand begins to come down [m]
 YAWS = np.radians(np.arange(-90, 90, 15))
 
 
@@ -97,7 +97,7 @@ def _hindrances(situation: Situation, thing: str, spots: Array, yaws: Array, lea
     obstacles = situation.surroundings(thing, middle, float(np.ptp(spots[:, :2], axis=0).max()) / 2 + HAND + CLEAR)
     gaps = clearance(spots, yaws, obstacles, leans)
     wrists = spots.copy()
-    wrists[:, :2] -= WRIST * np.tan(leans)[:, None] * np.column_stack([np.cos(yaws), np.sin(yaws)])
+    wrists[:, :2] -= DESCENT * np.tan(leans)[:, None] * np.column_stack([np.cos(yaws), np.sin(yaws)])
     return 3 * np.maximum(0, CLEAR - gaps) + 10 * np.maximum(0, TOUCHING - gaps) + reach_costs(situation, wrists)
 
 
