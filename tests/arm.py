@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from vla.deploy.joint_limiter import JointLimits
@@ -34,12 +36,16 @@ ROBOT = JointLimits(
     speed=[2.0] * 7,
     acceleration=[50.0] * 7,
     fingers=["left", "right"],
-    finger_travel=0.04,
+    finger_open=[0.04, 0.04],
+    finger_closed=[0.0, 0.0],
+    widest=0.08,
     margin=0.05,
     overshoot=0.01,
     speed_share=1.0,
     acceleration_share=1.0,
 )
+
+NO_FINGERS: dict[str, Any] = {"fingers": [], "finger_open": [], "finger_closed": [], "widest": None}
 
 SAFETY = Safety(
     image_age=0.3,

@@ -114,7 +114,7 @@ class Session:
         return make("std_msgs/msg/Header", stamp=stamp, frame_id="")
 
     def _joint_state(self, joints: Array) -> Any:
-        fingers = np.full(2, self.opening * ROBOT.finger_travel)
+        fingers = np.array(ROBOT.finger_positions(self.opening))
         position = np.concatenate([fingers, joints])
         names = {"name": [*ROBOT.fingers, *ROBOT.joints], "position": position}
         nothing = {"velocity": np.empty(0), "effort": np.empty(0)}

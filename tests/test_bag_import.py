@@ -13,7 +13,7 @@ import bags
 import composing
 import numpy as np
 import pytest
-from arm import ARM, ROBOT, SPEC
+from arm import ARM, NO_FINGERS, ROBOT, SPEC
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from vla.config.build import build
@@ -131,8 +131,11 @@ def test_without_rosbags_a_sentence_says_what_to_install(
         ({"topics": replace(TOPICS, commands="/words")}, "/words can be used: they are of type std_msgs/msg/Str"),
         ({"robot": replace(ROBOT, joints=[f"fr3_joint{n}" for n in range(1, 8)])}, "lacks fr3_joint1, .* has"),
         ({"robot": replace(ROBOT, joints=ROBOT.joints[::-1])}, r"panda_joint1 where expert\.robot\.joints has"),
-        ({"robot": replace(ROBOT, fingers=[])}, r"name the joints in expert\.robot\.fingers"),
-        ({"robot": replace(ROBOT, fingers=[]), "spec": UNSEEN_GRIPPER}, r"moves a gripper: .* expert\.robot\.fingers"),
+        ({"robot": replace(ROBOT, **NO_FINGERS)}, r"name the joints in expert\.robot\.fingers"),
+        (
+            {"robot": replace(ROBOT, **NO_FINGERS), "spec": UNSEEN_GRIPPER},
+            r"moves a gripper: .* expert\.robot\.fingers",
+        ),
         ({"spec": replace(SPEC, robot=None)}, "expert=bag needs a robot"),
         ({"spec": replace(SPEC, cameras=("top",))}, r"no topic for cameras top: add \+expert\.topics"),
     ],

@@ -138,6 +138,21 @@ def test_a_plan_begins_with_what_is_executed_until_it_arrives(method: Callable[[
     np.testing.assert_array_equal(unaware, again.plan(second))  # switched off, nothing has changed
 
 
+def test_a_delay_beyond_the_trained_prefix_is_limited_to_it_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    model, (first, second, *_) = make_flow(prefix=2), observations(2)
+    policy, given = as_policy(model, chunking=TrainedPrefix()), list[list[int]]()
+    plan = policy.plan(first)
+    model.predict = lambda batch: given.append(batch["delay"].tolist()) or Flow.predict(model, batch)  # type: ignore[method-assign]
+    policy._predict_chunk = model.predict
+    for delay in (2, 3, 5):
+        policy.plan(replace(second, running=RunningPlan(plan[3:], delay)))
+    assert given == [[2], [2], [2]]
+    assert [record.getMessage() for record in caplog.records] == [
+        "a plan arrives 3 actions late, more than model.prefix=2 of its training: it may not continue the running one; "
+        "train with a larger one"
+    ]
+
+
 @every_method
 def test_lanes_continue_their_own_plans(method: Callable[[], Chunking]) -> None:
     model, (first, second, third, *_) = make_flow(), observations(3)

@@ -24,7 +24,7 @@ from vla.config.compose import compose as compose_whole
 from vla.config.differences import differences
 from vla.config.experiment import Experiment, to_plain
 from vla.robots.cartesian import LIMIT_MARGIN
-from vla.robots.panda import FINGER_TRAVEL, JOINT_HIGH, JOINT_LOW, JOINT_SPEED
+from vla.robots.panda import FINGER_TRAVEL, JOINT_HIGH, JOINT_LOW, JOINT_SPEED, MAX_OPENING
 from vla.spec import FIRST_SEED
 from vla.tasks.tabletop.environment import Tabletop
 from vla.tasks.tabletop.goals.skills import REST_STEPS
@@ -250,7 +250,8 @@ def nodes(value: Any) -> Iterator[dict[str, Any]]:
 def test_numbers_that_the_simulator_and_a_file_need_are_equal() -> None:
     robot = defaults_of("deploy/robot/panda")
     np.testing.assert_array_equal([robot["low"], robot["high"], robot["speed"]], [JOINT_LOW, JOINT_HIGH, JOINT_SPEED])
-    assert (robot["margin"], robot["finger_travel"]) == (LIMIT_MARGIN, FINGER_TRAVEL)
+    assert (robot["margin"], robot["finger_open"]) == (LIMIT_MARGIN, [FINGER_TRAVEL] * 2)
+    assert (robot["widest"], robot["finger_closed"]) == (MAX_OPENING, [0, 0])
     node = composed("job=deploy", "deploy=ros2").deploy
     np.testing.assert_array_equal(node.safety.workspace, WORKSPACE)
     assert composed().evaluate.seed == FIRST_SEED == composed("job=deploy", "deploy=simulator").deploy.seed

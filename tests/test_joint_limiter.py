@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arm import NO_FINGERS
 from arm import ROBOT as PANDA
 from composing import CONF
 from defaults import defaults_of
@@ -15,7 +16,7 @@ from vla.deploy.motion import LEEWAY, _Workspace
 
 PERIOD = 0.02
 TWO = {"joints": ["a", "b"], "low": [-1.0, -2.0], "high": [1.0, 2.0], "speed": [2.0, 1.0], "acceleration": [10.0, 5.0]}
-ROBOT = replace(PANDA, **TWO, fingers=[], speed_share=0.5, acceleration_share=0.5)
+ROBOT = replace(PANDA, **TWO, **NO_FINGERS, speed_share=0.5, acceleration_share=0.5)
 
 
 @pytest.fixture

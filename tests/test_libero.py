@@ -195,7 +195,10 @@ def test_no_official_state_counts_twice() -> None:
     with pytest.raises(UserError, match=r"evaluate\.episodes=2000: there are 500 different ones, .*episodes=500$"):
         require_possible(of_goal())
     require_possible(of_goal("evaluate.episodes=500"))
-    require_possible(of_goal("evaluate.seed=2000000"))  # drawn starts
+    require_possible(of_goal("evaluate.seed=2000000", "validate.seed=3000000"))  # drawn starts
+    for seed in (1_000_500, 1_500_000):
+        with pytest.raises(UserError, match=rf"validate\.seed={seed} and .* share initial states, .*seed=2000000$"):
+            require_possible(of_goal("evaluate.episodes=500", f"validate.seed={seed}"))
     with pytest.raises(UserError, match="there are 50 different ones in the condition one, "):
         require_possible(of_goal("evaluate.episodes=500", "+evaluate.conditions.one={tasks: [0]}"))
 

@@ -103,6 +103,21 @@ def test_fingers_may_come_in_messages_of_their_own_with_further_joints() -> None
     assert states.read(joints(), 2.0) is not None
 
 
+def test_a_hinge_that_closes_at_a_larger_angle_gives_the_opening_and_is_commanded_by_it() -> None:
+    limits = replace(ROBOT, finger_open=[0.0, 0.1], finger_closed=[0.8, -0.7], widest=0.085)
+    for share, left, right in ((1.0, 0.0, 0.1), (0.25, 0.6, -0.5), (0.0, 0.8, -0.7)):
+        measured = messages.JointStates(limits).read(joints(position=[left, 2.0, 9.0, 1.0, right]), 0.0)
+        assert measured is not None and measured.opening == pytest.approx(0.085 * share)
+        command = Command(np.zeros(2), np.zeros(2), share)
+        assert commands.finger_positions(limits, command) == pytest.approx([left, right])
+        names = ["one", "two", "left", "right"]
+        assert messages.command_from(names, [0.1, 0.2, left, right], limits)[1] == pytest.approx(share)
+    incomplete: Any
+    for incomplete in ({"widest": None}, {"finger_open": [0.0]}, {"finger_open": [0.0, -0.7]}):
+        with pytest.raises(ValueError, match=r"^deploy\.robot\.fingers need, in finger_open and finger_closed, "):
+            replace(limits, **incomplete)
+
+
 def test_joints_are_found_by_name() -> None:
     """Without a velocity they are at rest, and further joints do not matter."""
     states = messages.JointStates(ROBOT)

@@ -331,6 +331,10 @@ def test_what_makes_runs_differ_is_told(tmp_path: Path) -> None:
     told = text(compared([plain, dark], tmp_path / "new"))
     assert "plain 100.0" in told and "Differences in success" not in told  # equal seeds, other scenes
     assert "not compared, because no episode is the same in both plain and dark" in told
+    brighter = a_run(tmp_path / "brighter", "ssssssss")
+    change(brighter, lambda content: content["config"]["evaluate"]["conditions"].update(dark={"light": 0.5}))
+    told = text(compared([plain, brighter], tmp_path / "some"))
+    assert "not compared under a condition, because its worlds differ plain and brighter (dark)" in told
     crashing = a_run(tmp_path / "crashing", "sseeeeee")
     for folder, mujoco in ((plain, "3.3.0"), (crashing, "3.17.0")):
         change(folder, lambda content, mujoco=mujoco: content.update(versions={"mujoco": mujoco, "torch": "2.13"}))

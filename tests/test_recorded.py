@@ -13,7 +13,7 @@ import composing
 import numpy as np
 import pyarrow as pa
 import pytest
-from arm import ROBOT, SAFETY
+from arm import NO_FINGERS, ROBOT, SAFETY
 from command_line import SMALL, here
 from exporting import exporter
 from fake_batch import as_policy, make_bc
@@ -378,7 +378,7 @@ def test_units_are_tabulated_where_there_are_some() -> None:
 
 
 JOINTS = replace(ROBOT, joints=["a", "b", "c"], low=[-1.5] * 3, high=[1.5] * 3, speed=[2.0] * 3,
-                 acceleration=[50.0] * 3, fingers=[])  # fmt: skip
+                 acceleration=[50.0] * 3, **NO_FINGERS)  # fmt: skip
 
 
 def test_joint_positions_in_degrees_move_a_robot_in_radians() -> None:

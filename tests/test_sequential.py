@@ -132,3 +132,6 @@ def test_a_run_is_compared_on_the_episodes_that_both_played() -> None:
     assert elsewhere.say(a_report("1", True)) == "no episode in common with A"
     with pytest.raises(ValueError, match="has no episode in common"):
         elsewhere.is_decided(a_report("1", True))
+    same = a_report("1").results[0]
+    swapped = RunStatement("A", {FIRST_SEED: replace(same, task="goal_swap_0")}, 0.02)
+    assert swapped.say(a_report("1", True)) == "no episode in common with A"  # though sentence and draws are equal

@@ -522,6 +522,7 @@ def test_another_policy_after_a_restart_is_noticed() -> None:
     with serving(history) as agent._connection.url:
         agent.reset(seen.instruction, 1)
         assert (agent.metadata["history"], agent.history) == (history.model.history, history.model.history)
+        assert agent.metadata["execute"] == 1  # which needs every observation
         np.testing.assert_array_equal(agent.act(seen), as_policy(history.model).plan(seen)[0])
         agent.close()
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import logging
 import timeit
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,12 +20,14 @@ from torch import Tensor
 
 from vla.io.errors import UserError
 from vla.io.types import Count
-from vla.models.chunking import Chunking, require_chunking
+from vla.models.chunking import Chunking, TrainedPrefix, require_chunking
 from vla.models.compilation import prepare_compilation
 from vla.models.layers import Batch
 from vla.models.model import Model
 from vla.schedule import Schedule
 from vla.spec import LONGEST_INSTRUCTION, Array, Observation, RunningPlan, Spec
+
+log = logging.getLogger(__name__)
 
 PolicyInput = Observation | Mapping[str, Any] | Sequence[Observation | Mapping[str, Any]]  # of one lane, or of several
 NO_PLAN = RunningPlan(np.empty((0, 1), np.float32), 0)  # no plan is executed
@@ -92,6 +95,8 @@ class Policy:
         if chunking is not None:
             require_chunking(type(chunking), type(model), model.prefix)
             model.chunking = chunking
+        self._longest_delay = model.prefix if isinstance(chunking, TrainedPrefix) else model.chunk
+        self._warned = False  # that plans arrive later
         self.execute = model.execute  # number of actions of a chunk to execute
         self.history = model.history  # number of input frames; if several, it must be given every observation
         self._bf16 = precision == "bf16"
@@ -250,10 +255,19 @@ class Policy:
             rest = running.actions[: self.model.chunk]
             padded = np.zeros((self.model.chunk, len(self._low)), np.float32)
             padded[: len(rest)] = rest
-            counts = {"remaining": len(rest), "delay": min(running.delay, len(rest))}
+            counts = {"remaining": len(rest), "delay": min(self._known_delay(running.delay), len(rest))}
             inputs |= {name: torch.tensor([count], device=self.device) for name, count in counts.items()}
             inputs["running"] = torch.from_numpy(padded)[None].to(self.device)
         return inputs
+
+    def _known_delay(self, delay: int) -> int:
+        """Return the delay of a plan, or the longest one that the model was trained for, with a warning."""
+        if delay > self._longest_delay and not self._warned:
+            self._warned, text = True, "a plan arrives %d actions late, more than model.prefix=%d of its training: %s"
+            log.warning(
+                text, delay, self._longest_delay, "it may not continue the running one; train with a larger one"
+            )
+        return min(delay, self._longest_delay)
 
     def window(self, lane: int = 0) -> Batch:
         """Return the model input of a lane, a batch of one: the frames so far, padded to the history of the model."""

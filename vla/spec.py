@@ -44,7 +44,7 @@ class RobotModel:
     __pydantic_config__ = STRICT
 
     joints: Names  # names of the joint positions in the state, base to tip; [rad], or as `state_units` says
-    frame: Annotated[str, MaxLen(100)]  # reference frame of Cartesian actions
+    frame: Annotated[str, MaxLen(100)]  # reference frame of Cartesian actions and of the chain
     velocities: Annotated[tuple[Name, ...], MaxLen(100), Predicate(unique)] = ()  # joint velocities, in the same order
     gripper: Name | None = None  # gripper opening [m] in the state
     # (J + 1, 7) pose of each joint frame, and of the tool frame, in the frame before: offset [m], quaternion wxyz.
@@ -337,7 +337,7 @@ class Environment(Protocol):
         events: (step, description) of what the agent did not cause, such as disturbances; recordings mark them,
         instructions, completed: number of instructions in the current episode, each given when the previous one is
             completed, and number completed; the episode succeeds when all are completed, and fails when one fails,
-        distinct: a method, range of seeds → number of distinct episodes, if some seeds give the same episode.
+        distinct: a method, seeds → number of distinct episodes, if some seeds give the same episode.
     """
 
     spec: Spec

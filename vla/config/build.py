@@ -17,7 +17,7 @@ from importlib import import_module
 from operator import or_
 from typing import Annotated, Any, Literal
 
-from annotated_types import Gt, Le, MinLen, Predicate
+from annotated_types import Ge, Le, MinLen, Predicate
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
@@ -106,7 +106,7 @@ NARROWER_TYPES: dict[str, dict[str, Any]] = {
         "val_check_interval": Count,
         "check_val_every_n_epoch": Literal[1] | None,
         "limit_val_batches": Natural | Share | None,
-        "limit_train_batches": Count | Annotated[float, Gt(0), Le(1)] | None,
+        "limit_train_batches": Annotated[float, Ge(1), Le(1)] | None,  # fewer would end an epoch
         "log_every_n_steps": Count,
         "precision": Literal["fp32", "bf16"],
     }

@@ -202,9 +202,11 @@ class _Bag:
             self.openings.append((arrival, np.array(opening)))
 
     def _command_fingers(self, arrival: float, message: Any) -> None:
+        fingers = dict(zip(self._limits.fingers, message.data, strict=False))
         if not len(message.data) or not np.isfinite(message.data).all():
             raise UserError("finger positions are missing or not finite")
-        self.openings.append((arrival, np.mean(message.data) / self._limits.finger_travel))
+        if fingers:
+            self.openings.append((arrival, np.array(self._limits.opening(fingers))))
 
 
 class BagDemonstrations(imported.ImportedDemonstrations):
@@ -337,7 +339,7 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         openings = bag.openings[: bisect_right(bag.openings, end, key=ARRIVAL)][-1:]
         if openings and openings[0][0] >= segment.start:  # an earlier command was the policy's, not the person's
             return np.insert(motion, self._gripper, openings[0][1])
-        return np.insert(motion, self._gripper, _interpolate(bag.measured, end)[joints] / self._limits.stroke)
+        return np.insert(motion, self._gripper, self._limits.share(_interpolate(bag.measured, end)[joints]))
 
 
 def _covers(track: Track, time: float) -> bool:

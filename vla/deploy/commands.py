@@ -116,8 +116,8 @@ class GripperOutput:
 
 
 def finger_positions(limits: JointLimits, command: Command) -> list[float]:
-    """Return the target position of every finger joint [m]; none if the command leaves the gripper as it is."""
-    return [] if command.opening is None else [command.opening * limits.finger_travel] * len(limits.fingers)
+    """Return the target position of every finger joint; none if the command leaves the gripper as it is."""
+    return [] if command.opening is None else limits.finger_positions(command.opening)
 
 
 def trajectory(limits: JointLimits, commands: Sequence[Command], tick: float) -> JointTrajectory:

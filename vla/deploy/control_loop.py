@@ -260,7 +260,7 @@ class ControlLoop:
     def _take_over(self, state: JointMeasurement, now: float) -> None:
         """Make the measured pose the first commanded one."""
         try:
-            self.motion.start(state.joints, float(np.clip(state.opening / self.limits.stroke, 0.0, 1.0)), now)
+            self.motion.start(state.joints, None, now)  # a grip would loosen at its measured opening
         except UserError as error:
             self.fail(str(error))
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vla.policy import Policy
 from vla.spec import Array, Observation
+
+if TYPE_CHECKING:
+    from vla.policy import Policy
 
 
 class Inference:

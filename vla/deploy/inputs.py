@@ -15,7 +15,7 @@ from vla.deploy import messages
 from vla.deploy.control_loop import ControlLoop
 from vla.deploy.diagnostics import Diagnostics
 from vla.deploy.lifecycle_node import GuardedLifecycleNode
-from vla.deploy.observer import MAX_STAMP_AGE
+from vla.deploy.observer import MAX_CLOCK_ERROR, MAX_STAMP_AGE
 from vla.deploy.settings import COMPRESSED, PolicySettings
 from vla.io.errors import UserError
 from vla.spec import LONGEST_INSTRUCTION
@@ -62,7 +62,8 @@ class Inputs:
 
     def _age(self, source: str, message: Any) -> float:
         """Return the age of a message [s] by its time stamp, 0 if that is of another clock. Raises a UserError if the
-        clock is frozen, or the message is older than `MAX_STAMP_AGE` although the clock was once that of this node."""
+        clock is frozen or ahead of this one, as its messages would seem younger than they are, or the message is older
+        than `MAX_STAMP_AGE` although the clock was once that of this node."""
         stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
         if stamp == (0, 0):
             return 0.0
@@ -72,6 +73,8 @@ class Inputs:
         age = self._node.get_clock().now().nanoseconds * 1e-9 - (stamp[0] + stamp[1] * 1e-9)
         if age >= MAX_STAMP_AGE and source in self._synchronised:
             raise UserError(f"its time stamp is {age:.0f} s old")
+        if -MAX_STAMP_AGE < age < -MAX_CLOCK_ERROR:
+            raise UserError(f"its time stamp is {-age:.2f} s in the future: synchronise the clocks")
         if not 0 <= age < MAX_STAMP_AGE:
             return 0.0
         self._synchronised.add(source)

@@ -5,6 +5,7 @@ Shapes: J joints. Positions [rad], speeds [rad/s], accelerations [rad/s²].
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
@@ -31,7 +32,9 @@ class JointLimits:
         low, high: position limits [rad].
         speed, acceleration: limits [rad/s], [rad/s²].
         fingers: names of the finger joints.
-        finger_travel: position of a finger joint when open; 0 is closed [m].
+        finger_open, finger_closed: position of each of them when the gripper is open, and at an opening of 0, between
+            which the opening is proportional [m] or [rad].
+        widest: opening of the open gripper, in the policy's state [m]; None without fingers.
         margin: distance kept from the position limits [rad].
         overshoot: largest overshoot of the last goal, which lets joints pass goals without stopping [rad].
         speed_share, acceleration_share: usable share of those limits, above 0 and at most 1.
@@ -43,7 +46,9 @@ class JointLimits:
     speed: list[Positive]
     acceleration: list[Positive]
     fingers: list[Text]
-    finger_travel: Positive
+    finger_open: list[float]
+    finger_closed: list[float]
+    widest: Positive | None
     margin: NonNegative
     overshoot: NonNegative
     speed_share: PositiveShare
@@ -57,6 +62,13 @@ class JointLimits:
             )
         if not unique([*self.joints, *self.fingers]):
             raise UserError("deploy.robot names a joint twice among its joints and fingers")
+        if not len(self.fingers) == len(self.finger_open) == len(self.finger_closed) or (
+            self.fingers and (self.widest is None or (self._finger_travel == 0).any())
+        ):
+            raise UserError(
+                "deploy.robot.fingers need, in finger_open and finger_closed, the position of each when the gripper is "
+                "open and another when it is closed, and in widest the opening of the open gripper in m"
+            )
         if not (self.min_position < self.max_position).all():
             raise UserError("deploy.robot.low must be below high by more than twice the margin, for every joint")
 
@@ -96,10 +108,23 @@ class JointLimits:
         """(J,) largest allowed accelerations [rad/s²]."""
         return np.array(self.acceleration) * self.acceleration_share
 
-    @property
-    def stroke(self) -> float:
-        """Opening of the gripper when open [m]; tiny without fingers, as openings are divided by it."""
-        return max(self.finger_travel * len(self.fingers), 1e-6)
+    @cached_property
+    def _finger_travel(self) -> Array:
+        return np.subtract(self.finger_open, self.finger_closed)
+
+    def share(self, opening: float) -> float:
+        """Return the opening, 0 closed … 1 open, of one in m; 0 without fingers."""
+        return opening / self.widest if self.widest else 0.0
+
+    def finger_positions(self, opening: float) -> list[float]:
+        """Return the position of every finger joint at an opening, 0 closed … 1 open."""
+        return (self.finger_closed + opening * self._finger_travel).tolist()
+
+    def opening(self, fingers: Mapping[str, float]) -> float:
+        """Return the opening, 0 closed … 1 open, at positions of one finger joint or more: the mean of theirs."""
+        indices = [self.fingers.index(name) for name in fingers]
+        travelled = np.array([*fingers.values()]) - np.array(self.finger_closed)[indices]
+        return float(np.mean(travelled / self._finger_travel[indices]))
 
 
 class JointLimiter:

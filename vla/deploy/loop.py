@@ -81,7 +81,8 @@ class Loop:
                 "deploy=loop: the simulator obeys deploy.agent.command=joint_state only, without deploy.agent.dry_run, "
                 "from an agent with deploy.agent.autostart"
             )
-        for name in ("topics", "network", "robot.joints", "robot.fingers", "robot.finger_travel"):
+        robot = ("joints", "fingers", "finger_open", "finger_closed", "widest")
+        for name in ("topics", "network", *(f"robot.{key}" for key in robot)):
             if attrgetter(name)(agent) != attrgetter(name)(simulator):
                 raise UserError(
                     f"deploy=loop: agent and simulator would not hear each other, because deploy.agent.{name} and "

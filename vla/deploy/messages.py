@@ -109,19 +109,28 @@ class JointStates:
         arm, fingers, names = self._limits.joints, self._limits.fingers, {*message.name}
         fingers_only = names >= {*fingers} and names.isdisjoint(arm)  # which may have further joints
         if fingers and fingers_only and len(names) < len(fingers) + len(arm):
-            self._fingers = (stamp, float(_positions(message, fingers)[0].sum()))
+            self._fingers = (stamp, self._opening(_positions(message, fingers)[0]))
             return None
         if stamp - self._fingers[0] <= FINGERS_AGE and names.isdisjoint(fingers):
             position, velocity = _positions(message, arm)
             opening = self._fingers[1]
         else:
             position, velocity = _positions(message, [*arm, *fingers])
-            opening = float(position[len(arm) :].sum())
+            opening = self._opening(position[len(arm) :])
         place, low, high = position[: len(arm)], np.array(self._limits.low), np.array(self._limits.high)
         if (violations := (place < low - LIMIT_TOLERANCE) | (place > high + LIMIT_TOLERANCE)).any():
             joint = int(np.argmax(violations))
             raise UserError(f"joint state has {arm[joint]} at {place[joint]:g} rad, where this arm cannot be")
         return JointMeasurement(stamp, place, velocity[: len(arm)], opening)
+
+    def _opening(self, fingers: Array) -> float:
+        """Return the opening [m] at positions of all fingers; 0 without any."""
+        limits = self._limits
+        return (
+            (limits.widest or 0.0) * limits.opening(dict(zip(limits.fingers, fingers, strict=True)))
+            if len(fingers)
+            else 0.0
+        )
 
 
 def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
@@ -152,6 +161,5 @@ def command_from(names: Sequence[str], positions: Any, limits: JointLimits) -> t
     if missing_joints or len(names) != len(positions) or not np.isfinite(positions).all():
         problem = f"lacks {', '.join(missing_joints)}" if missing_joints else "needs one finite position per name"
         raise UserError(f"joint command {problem}")
-    fingers = [positions[names.index(name)] for name in limits.fingers if name in names]
-    opening = float(np.mean(fingers)) / limits.finger_travel if fingers else None
-    return positions[[names.index(name) for name in limits.joints]], opening
+    fingers = {name: positions[names.index(name)] for name in limits.fingers if name in names}
+    return positions[[names.index(name) for name in limits.joints]], limits.opening(fingers) if fingers else None

@@ -42,7 +42,7 @@ class _Workspace:
     """Box that the tool point does not leave, whatever the joints do on their way between two goals."""
 
     forward: Callable[[Array], tuple[Array, Array]]  # as in `Kinematics`
-    low: Array  # corners (3,) in the base frame [m]
+    low: Array  # corners (3,) in the frame of Cartesian actions [m]
     high: Array
 
     def step(self, limiter: JointLimiter, goal: Array, remaining: float) -> None:

@@ -16,6 +16,7 @@ from vla.spec import Array, Spec
 
 EARLY_SHARE = 0.25  # share of a control period by which an image may precede the next planned observation
 HISTORY = 1.0  # duration of the history of joint states [s]
+MAX_CLOCK_ERROR = 0.1  # by which a time stamp may be in the future, because clocks differ [s]
 MAX_STAMP_AGE = 10.0  # age above which a time stamp is taken for that of another clock [s]
 MAX_SKEW = 0.05  # largest difference between the time stamps of one set of images [s]
 

@@ -38,7 +38,7 @@ class Safety:
     tracking_for: Positive  # … for so long [s]
     fresh_frames: Count  # consecutive matching sets of images after which a held arm moves again
     rejected: Count  # consecutive rejected plans that cause a fault
-    # opposite corners of the box for the tool point, in the base frame [m]; None for joint positions as actions
+    # opposite corners of the box for the tool point, in the frame of Cartesian actions [m]; None for joint positions
     workspace: tuple[Point, Point] | None
 
 

@@ -33,6 +33,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from vla.deploy.client_observation import Keys, instruction
+from vla.deploy.inference import actions_per_plan
 from vla.io.array_messages import pack, unpack
 from vla.io.errors import UserError, counted
 from vla.io.types import Count, Text
@@ -257,7 +258,7 @@ def metadata(policy: Policy, keys: Keys) -> dict[str, Any]:
         "action": {"names": list(spec.action), "units": list(spec.units), **bounds},
         "control_hz": spec.control_hz,
         "horizon": policy.model.chunk,
-        "execute": policy.execute,
+        "execute": actions_per_plan(policy),
         "history": policy.history,
         "chunking": policy.chunking is not None,
         "reset": True,

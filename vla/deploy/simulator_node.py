@@ -122,10 +122,10 @@ class SimulatorNode(Node):
     def _publish(self) -> None:
         stamp = self.get_clock().now().to_msg()
         joints, velocities, opening = self._measure()
-        fingers = len(self._limits.fingers)
+        fingers = self._limits.finger_positions(self._limits.share(opening))
         message = JointState(name=[*self._limits.joints, *self._limits.fingers])
-        message.position = [*joints.tolist(), *[opening / max(fingers, 1)] * fingers]
-        message.velocity = [*velocities.tolist(), *[0.0] * fingers] if len(velocities) else []
+        message.position = [*joints.tolist(), *fingers]
+        message.velocity = [*velocities.tolist(), *[0.0] * len(fingers)] if len(velocities) else []
         message.header.stamp = stamp
         self._joints.publish(message)
         self._until_frame -= self._period
@@ -139,7 +139,7 @@ class SimulatorNode(Node):
     def _hold_command(self) -> tuple[Array, float]:
         """Return the command that holds the measured pose: joints [rad] and opening 0 … 1."""
         joints, _, opening = self._measure()
-        return joints.astype(float), opening / self._limits.stroke
+        return joints.astype(float), self._limits.share(opening)
 
     def _measure(self) -> tuple[Array, Array, float]:
         """Return joints [rad], their velocities [rad/s] and the gripper's opening [m]."""

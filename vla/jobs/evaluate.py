@@ -57,7 +57,7 @@ from vla.runs.folder import (
 from vla.runs.played import PlayedEpisodes
 from vla.runs.resume import cached_success
 from vla.schedule import Delays
-from vla.spec import IN_DISTRIBUTION, Multitask
+from vla.spec import FIRST_SEED, IN_DISTRIBUTION, Multitask
 
 log = logging.getLogger(__name__)
 
@@ -263,6 +263,8 @@ def require_possible(experiment: Experiment) -> None:
         for name, changes in {IN_DISTRIBUTION: {}, **options.changes}.items():
             with closing(experiment.make_environment(changes)()) as world:
                 _require_distinct(name, world, options)
+                if trains and not changes:
+                    _require_unseen_in_validation(world, experiment.validate.seeds, options.seeds)
 
 
 def _changed_parts(changes: Mapping[str, Any]) -> frozenset[tuple[str, ...]]:
@@ -287,6 +289,15 @@ def _require_own(experiment: Experiment, output: Path) -> None:
         return
     if (output / LAST_CHECKPOINT).exists() or (output / POLICY).exists():
         raise UserError(f"{output} has a training of its own, whose report this would replace: add output=DIR")
+
+
+def _require_unseen_in_validation(world: Any, validation: range, evaluation: range) -> None:
+    """Raise a UserError if seeds that select the weights give episodes of the evaluation in a world."""
+    if world.distinct([*validation, *evaluation]) < world.distinct(validation) + world.distinct(evaluation):
+        raise UserError(
+            f"validate.seed={validation.start} and evaluate.seed={evaluation.start} share initial states, but episodes "
+            f"that select the weights must not evaluate them: set validate.seed={2 * FIRST_SEED}"
+        )
 
 
 def _require_distinct(condition: str, world: Any, options: Evaluation) -> None:

@@ -37,6 +37,8 @@ from vla.spec import FIRST_SEED
 
 log = logging.getLogger(__name__)
 
+ROUNDS = ("steps", "episodes", "seed", "changes")  # keys of what every round does
+
 
 def run(experiment: Experiment) -> float:
     """Improve a policy in rounds and return its success rate; finished rounds, and parts of one, are kept.
@@ -56,7 +58,7 @@ def run(experiment: Experiment) -> float:
 def _improve(experiment: Experiment, seeds: range) -> float:
     options, output = experiment.options(Rounds), experiment.output
     checkpoint, stores = experiment.pretrained, list[Path]()
-    if (report := read_report(output)) and (count := value_at(report.config, "improve.rounds", 0)) < options.rounds:
+    if (report := read_report(output)) and (count := value_at(report.config, "improve.rounds", 0)) != options.rounds:
         archive_evaluation(output, count)
     if checkpoint is None:
         checkpoint = _train(experiment.with_values({"job": "train", "output": str(output / "round_0")}))
@@ -71,13 +73,13 @@ def _improve(experiment: Experiment, seeds: range) -> float:
 
 
 def _save_config(experiment: Experiment) -> None:
-    """Save the config for `resume=`; raise a UserError if the folder has rounds of another training or length."""
+    """Save the config for `resume=`; raise a UserError if the folder has rounds with other episodes or lengths."""
     saved_config = read_run(experiment.output).config
     if saved_config.get("job") == "improve":
         # Later trainings continue the earlier ones, which must not get another length.
         has_rounds = is_store(experiment.output / "round_1" / EPISODES)
         lengths = [f"trainer.{name}" for name in LENGTHS] if experiment.pretrained is None else []
-        keys = (*lengths, "improve.steps") if has_rounds else ()
+        keys = (*lengths, *(f"improve.{name}" for name in ROUNDS), "policy") if has_rounds else ()
         require_identity(saved_config, experiment.config, experiment.output, keys)
     if saved_config != experiment.config:  # else a new date would suggest that the rounds began again
         save_config(experiment.output, experiment.config, experiment.changes)

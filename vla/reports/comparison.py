@@ -88,8 +88,16 @@ def _compare_rows(one: SweepRow, other: SweepRow, condition: str) -> dict[str, C
 
 def remarks(runs: Mapping[str, Run], comparisons: Comparisons | None = None) -> dict[str, str]:
     """Return remark → the names of the runs that it concerns; given comparisons, also the pairs that have none."""
-    compared_pairs = {(one, other) for other, one, _ in comparisons or ()}
+    compared_pairs = dict.fromkeys((one, other) for other, one, _ in comparisons or ())
     pairs = [] if comparisons is None else [pair for pair in combinations(runs, 2) if pair not in compared_pairs]
+    conditions_left_out = [
+        f"{one} and {other} ({condition})"
+        for one, other in compared_pairs
+        for condition in runs[one].reports
+        if condition in runs[other].reports
+        and (other, one, condition) not in (comparisons or ())
+        and not _repeats_training_condition((runs[one], runs[other]), condition)
+    ]
     versions: dict[str, dict[str, None]] = {}  # library → its versions, in order and without repetition
     for run in runs.values():
         for library, version in run.report.versions.items() if run.report else ():
@@ -102,6 +110,7 @@ def remarks(runs: Mapping[str, Run], comparisons: Comparisons | None = None) -> 
     ]
     names_by_remark = {
         "not compared, because no episode is the same in both": [f"{one} and {other}" for one, other in pairs],
+        "not compared under a condition, because its worlds differ": conditions_left_out,
         "evaluated with different versions": [f"{n} {' and '.join(v)}" for n, v in versions.items() if len(v) > 1],
         "episodes that ended in errors, which count nowhere": failures,
     }
@@ -137,7 +146,9 @@ def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
     For other conditions than the first, and for some worlds, only the config tells what was drawn.
     """
     results, scenes = run.reports.get(condition, Report(())).results, _scenes(run, condition)
-    return {each.seed: (each, (each.instruction, each.draws or scenes)) for each in results if each.outcome != ERROR}
+    return {
+        each.seed: (each, (each.episode, None if each.draws else scenes)) for each in results if each.outcome != ERROR
+    }
 
 
 def _scenes(run: Run, condition: str) -> tuple[Any, ...]:

@@ -28,7 +28,8 @@ TOLERANCE = 1e-4  # [m] and [rad]
 class Kinematics:
     """Model of an arm for inverse kinematics."""
 
-    # Joints (J,) → pose (4, 4) of the tool in the base frame [m], and Jacobian (6, J), linear [m/rad] above angular.
+    # Joints (J,) → pose (4, 4) of the tool [m], and Jacobian (6, J), linear [m/rad] above angular, in the frame of the
+    # actions: the base's, or that of a world in which the base may stand elsewhere.
     forward: Callable[[Array], tuple[Array, Array]]
     home: Array  # (J,) with the gripper pointing down over the table [rad]
     lowest: Array  # (J,) smallest positions [rad]
@@ -93,7 +94,7 @@ class CartesianController:
     motion = (("dx", "m"), ("dy", "m"), ("dz", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
     def __init__(self, arm: Kinematics, period: float, low: ArrayLike, high: ArrayLike) -> None:
-        """Take the arm, its control period [s] and corners (3,) of the box for the tool point in the base frame [m]."""
+        """Take the arm, its control period [s] and corners (3,) of the box for the tool point [m]."""
         self.arm, self.period, self.low, self.high = arm, period, np.asarray(low), np.asarray(high)
         self.reset(arm.home)
 
@@ -109,7 +110,7 @@ class CartesianController:
         """Return joint targets (J,) [rad] one period ahead, within position and speed limits.
 
         Args:
-            motion: (6,) translation [m] and rotation vector [rad] in the base frame.
+            motion: (6,) translation [m] and rotation vector [rad], in the frame of the arm's kinematics.
         """
         target = np.eye(4)
         target[:3, 3] = np.clip(self.pose[:3, 3] + motion[:3], self.low, self.high)

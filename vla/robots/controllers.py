@@ -49,7 +49,7 @@ def controller_for(
 
     Args:
         spec: of the policy.
-        workspace: opposite corners of the box for the tool point of Cartesian motion, in the base frame [m].
+        workspace: opposite corners of the box for the tool point of Cartesian motion, in the frame of that [m].
         limits: (J,) smallest and largest positions [rad] and speeds [rad/s] of the arm; None: there are none.
 
     Raises:

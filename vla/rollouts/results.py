@@ -39,6 +39,11 @@ class Result:
         """Whether the outcome is "success"."""
         return self.outcome == "success"
 
+    @property
+    def episode(self) -> tuple[str, str, dict[str, Any]]:
+        """What tells episodes of one seed apart, in worlds that record their draws: task, instruction and draws."""
+        return self.task, self.instruction, self.draws
+
 
 def recording_name(seed: int, outcome: str) -> str:
     """Return the name of the recording of an episode; in alphabetical order failures come first, and seeds ascend."""

@@ -76,8 +76,7 @@ class RunStatement:
         `same_episode`: of the same one only; under another goal or level of randomisation a seed gives another episode.
         """
         pairs = [(self.results[result.seed], result) for result in report.results if result.seed in self.results]
-        matches = [(one.instruction, one.draws) == (two.instruction, two.draws) for one, two in pairs]
-        return [pair for pair, match in zip(pairs, matches, strict=True) if match or not same_episode]
+        return [(one, two) for one, two in pairs if one.episode == two.episode or not same_episode]
 
 
 Statement = BarStatement | RunStatement

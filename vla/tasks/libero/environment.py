@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Literal
 
 import mujoco
@@ -101,10 +101,10 @@ class Libero(MultitaskWorld):
             truth=(("object", 3), ("goal", 3)),
         )
 
-    def distinct(self, seeds: range) -> int:
+    def distinct(self, seeds: Iterable[int]) -> int:
         """Return the number of distinct episodes of seeds: each task has only `STATES` official states."""
-        official_seeds = range(max(seeds.start, FIRST_SEED), min(seeds.stop, END))
-        return len(seeds) - max(0, len(official_seeds) - STATES * len(self._tasks))
+        count = STATES * len(self._tasks)
+        return len({FIRST_SEED + seed % count if FIRST_SEED <= seed < END else seed for seed in seeds})
 
     @property
     def tool(self) -> Array:
