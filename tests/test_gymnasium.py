@@ -18,6 +18,7 @@ from vla.config import packages
 from vla.config.adopt import adopt
 from vla.config.build import build
 from vla.config.experiment import to_plain
+from vla.envs.gym import Task
 from vla.rollouts.rollout import rollout
 from vla.spec import Environment
 from vla.tasks.gymnasium import Gymnasium
@@ -164,11 +165,18 @@ def test_what_the_command_line_names_is_trusted_and_what_a_file_names_is_not(
     monkeypatch.setenv(packages.TRUSTED, "")
     with pytest.raises(ValueError, match=r"task names toy_gym, which is not trusted: add trust=\[toy_gym\]"):
         build(node(), "task")
+    arguments = {name: value for name, value in node().items() if name != "_target_"}
+    Task("gymnasium", **arguments).close()  # in Python the caller has chosen the package
     packages.trust([], [], ["toy_gym", "???"])
     build(node(), "task").close()
     for name in ("os", "torch", "numpy", None):
         with pytest.raises(ValueError, match=rf"package cannot name {name!r}: give the name by which a package is"):
             packages.trust([], [], [name])
+    packages.trust([], [], ["gymnasium"])
+    with pytest.raises(ValueError, match=r"task\.id=Pendulum-v1 cannot be played"):  # which draws by pygame
+        build(
+            node(package="gymnasium", id="Pendulum-v1", images={"above": "render"}, state={"observation": None}), "task"
+        )
     packages.trust([], [])
     file = save_policy(tmp_path / "policy", to_plain(composed(*VALUES)))
     with pytest.raises(ValueError, match=r"policy names toy_gym, which is not trusted: add trust=\[toy_gym\]"):

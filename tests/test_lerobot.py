@@ -11,6 +11,7 @@ from collections import Counter
 from fractions import Fraction
 from pathlib import Path
 
+import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -21,6 +22,7 @@ from toy import ARM_SPEC
 
 from vla.data.episodes import EpisodeStore
 from vla.data.formats.lerobot_images import decode, encode
+from vla.io.errors import UserError
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +40,24 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_video_leaves_the_priority_of_all_threads(tmp_path: Path) -> None:
     encode(tmp_path / "video.mp4", np.zeros((1, 3, 64, 64, 3), np.uint8), (64, 64), Fraction(10), 30)
     assert os.SCHED_FIFO not in {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")}
+
+
+def test_frames_before_a_key_frame_are_found_though_they_need_the_one_before_it(tmp_path: Path) -> None:
+    """In open groups of pictures, which HEVC has by default."""
+    path, options = tmp_path / "video.mp4", {"x264-params": "open-gop=1:keyint=5:min-keyint=5:scenecut=0:bframes=3"}
+    with av.open(path, "w", format="mp4") as file:
+        stream = file.add_stream("libx264", rate=10, options=options)
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+        for level in range(20, 200, 5):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((64, 64, 3), level, np.uint8), format="rgb24")))
+        file.mux(stream.encode(None))
+    frames = list(decode(path, 0.0, 36, Fraction(10), (64, 64)))
+    assert len(frames) == 36
+    for start in range(35):
+        found = list(decode(path, start / 10, 2, Fraction(10), (64, 64)))
+        np.testing.assert_array_equal(found, frames[start : start + 2])
+    with pytest.raises(UserError, match=r"lacks the frame at 3\.600 s"):
+        list(decode(path, 3.0, 7, Fraction(10), (64, 64)))
 
 
 def test_every_row_is_that_of_the_store(home: Path) -> None:

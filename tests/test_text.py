@@ -150,6 +150,8 @@ def test_synonyms_are_one_word() -> None:
     assert torch.equal(plain, other)
     there, elsewhere = encoder.tokenize(["pick up the pad", "pick up the putter"])
     assert not torch.equal(there, elsewhere)
+    capitals = NGrams(width=8, **defaults_of("model/text/ngrams", synonyms={"Pick up": ["Grab"]}))
+    assert torch.equal(*capitals.tokenize(["pick up the block", "grab the block"]))
     with pytest.raises(UserError, match=r"model\.text\.synonyms has 'put' more than once"):
         NGrams(width=8, **defaults_of("model/text/ngrams", synonyms={"place": ["put"], "put": ["set"]}))
 

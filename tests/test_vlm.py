@@ -260,7 +260,9 @@ def test_keypoints_without_an_image_encoder_are_refused() -> None:
         SmolVLA(**SMOLVLA | {"keypoints": 3})
 
 
-def test_published_weights_and_statistics_are_loaded(tmp_path: Path, tokenizer: Path) -> None:
+def test_published_weights_and_statistics_are_loaded(
+    tmp_path: Path, tokenizer: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     def as_bfloat16(weights: dict[str, Any]) -> None:
         name = "model.vlm_with_expert.vlm.lm_head.weight"  # which is published, and no action depends on it
         weights[name] = torch.zeros(3, 4)
@@ -275,6 +277,9 @@ def test_published_weights_and_statistics_are_loaded(tmp_path: Path, tokenizer: 
         make_smolvla(tokenizer, trunk=str(folder), statistics="pretrained", normalization="quantiles", cameras=cameras)
     model = make_smolvla(tokenizer, trunk=str(folder), statistics="pretrained", cameras=cameras)
     assert model.cameras == ["wrist", "front"]
+    assert not caplog.records
+    make_smolvla(tokenizer, trunk=str(folder), normalization="quantiles", cameras=cameras)  # by the demonstrations
+    assert "normalises by MEAN_STD, and model.normalization is quantiles: choose the same, unless" in caplog.text
     ours, theirs = make_smolvla(tokenizer), load_file(folder / "model.safetensors")
     loaded = {f"model.{name}": weight for name, weight in published(model.network)}
     assert loaded.keys() == theirs.keys() - {"model.vlm_with_expert.vlm.lm_head.weight"}
@@ -315,7 +320,9 @@ def write_trunk(folder: Path) -> dict[str, torch.Tensor]:
     state = make_smolvla().network.state_dict().items()
     weights = {f"model.{name.removeprefix('vlm.')}": weight for name, weight in state if name.startswith("vlm.")}
     further = {"model.text_model.layers.31.mlp.up_proj.weight": torch.zeros(2), "lm_head.weight": torch.zeros(2)}
-    save_file({**weights, **further}, folder / "model.safetensors")
+    (words,) = (name for name in weights if name.endswith("embed_tokens.weight"))
+    padded = {words: torch.cat([weights[words], torch.ones(3, weights[words].shape[1])])}  # as PaliGemma's is
+    save_file({**weights, **further, **padded}, folder / "model.safetensors")
     return weights
 
 
@@ -353,6 +360,7 @@ def test_other_weights_are_refused(tmp_path: Path, tokenizer: Path, change: Any,
         ({"num_expert_layers": 8}, "was trained with num_expert_layers=8, and only -1 is supported"),
         ({"max_period": 2.0}, r"was trained with max_period=2\.0, and only 4\.0 is supported"),
         ({"type": "act"}, "is a policy of LeRobot's type act, and only smolvla, pi0, pi05 are supported"),
+        ({"resize_imgs_with_padding": [512, 512]}, r"sees images of \[512, 512\] pixels, and the model of \["),
     ],
 )
 def test_policies_of_other_options_and_types_are_refused(

@@ -20,12 +20,13 @@ from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 import vla.config.resolvers  # noqa: F401  registers them
-from vla.config.annotations import is_node, locate
+from vla.config.annotations import is_node, locate, packages
 from vla.config.build import check_value
-from vla.config.experiment import Node, to_plain
-from vla.config.packages import CONF, offer_options
+from vla.config.experiment import Node, make_environment, to_plain
+from vla.config.packages import CONF, GYMNASIUM, MISSING, offer_options, trusting
 from vla.io.documents import read_yaml
 from vla.io.errors import UserError, suggestion
+from vla.spec import Environment
 
 log = logging.getLogger(__name__)
 
@@ -92,6 +93,13 @@ def compose_task(task: str, **overrides: Any) -> Node:
                 key, is_new = name.removeprefix("+"), name.startswith("+")
                 OmegaConf.update(config.task, key, plain_value, merge=True, force_add=is_new)
         return to_plain(config.task)
+
+
+def make_task(task: str, **overrides: Any) -> Environment:
+    """Build a task, see `compose_task`. The package that a task of gymnasium names is trusted: the caller chose it."""
+    node = compose_task(task, **overrides)
+    with trusting([name for name in packages(node) if name not in (MISSING, GYMNASIUM)]):
+        return make_environment(node)
 
 
 @cache

@@ -27,6 +27,7 @@ TRUST = "VLA_TRUST"  # environment variable of the user: packages, separated by 
 TRUSTED = "VLA_TRUSTED"  # environment variable that passes trusted packages and classes to child processes
 ENTRY_POINTS = "vla.conf"
 MISSING = "???"  # a value that the command line must give
+GYMNASIUM = "gymnasium"  # the package whose own environments need no trust
 PACKAGE = Path(__file__).resolve().parents[1]
 # Options of `vla` itself: inside the package if installed from a wheel, beside it in a clone.
 CONF = next(path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if (path / "config.yaml").is_file())
@@ -90,7 +91,7 @@ def trust(packages: Any, targets: Iterable[Any], node_packages: Iterable[Any] = 
     """
     if not isinstance(packages, list):
         raise UserError(f"trust must be a list of packages, as in trust=[mypackage], got {packages!r}")
-    node_packages = [name for name in node_packages if name != MISSING]
+    node_packages = [name for name in node_packages if name not in (MISSING, GYMNASIUM)]
     names = [*packages, *_names(TRUST), *node_packages]
     for name in names:
         _require_trustworthy("package" if name in node_packages else "trust", name)

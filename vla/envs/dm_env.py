@@ -8,8 +8,7 @@ import dm_env
 import numpy as np
 from dm_env import TimeStep, specs
 
-from vla.config.compose import compose_task
-from vla.config.experiment import make_environment
+from vla.config.compose import make_task
 from vla.spec import FIRST_SEED, Array, Environment, Observation
 
 
@@ -65,7 +64,7 @@ class DmEnvironment(dm_env.Environment):
 
 def load(task: str, random_state: int | np.random.RandomState | None = None, **overrides: Any) -> DmEnvironment:
     """Build a task of the config as a dm_env environment; see `vla.config.compose.compose_task`."""
-    return DmEnvironment(make_environment(compose_task(task, **overrides)), random_state)
+    return DmEnvironment(make_task(task, **overrides), random_state)
 
 
 def _arrays(observation: Observation) -> dict[str, Array]:

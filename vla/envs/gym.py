@@ -11,8 +11,7 @@ from gymnasium.error import CustomSpaceError
 from gymnasium.spaces import Box, Dict, Text
 from gymnasium.vector.utils import create_shared_memory
 
-from vla.config.compose import compose_task
-from vla.config.experiment import make_environment
+from vla.config.compose import make_task
 from vla.io.errors import UserError
 from vla.spec import FIRST_SEED, LONGEST_INSTRUCTION, Array, Environment, Observation
 
@@ -111,4 +110,4 @@ class Task(GymEnvironment):
 
     def __init__(self, task: str, render_mode: str | None = None, **overrides: Any) -> None:
         """Build an option of the group `task`; see `vla.config.compose.compose_task` and `GymEnvironment`."""
-        super().__init__(make_environment(compose_task(task, **overrides)), render_mode)
+        super().__init__(make_task(task, **overrides), render_mode)

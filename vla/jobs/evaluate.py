@@ -240,10 +240,8 @@ def require_possible(experiment: Experiment) -> None:
             delays = Delays(1 / experiment.world().spec.control_hz)
             delays.add(network.latency + network.jitter)
             require_fit(method, experiment["model"], delays.forecast)
-    if not experiment.playable and options.conditions:
+    if not experiment.playable and options.changes:
         raise UserError("evaluate.conditions change a world, and a recording has none: omit them")
-    if not experiment.playable and experiment["recorder"]:
-        raise UserError("recorder=rerun records what is played in a world, and a recording has none: omit it")
     if options.nearest is not None:
         open_memory(Path(options.nearest), None, experiment.world().spec)
     output = Path(settings.output)  # not created yet

@@ -71,6 +71,11 @@ class LeRobotDataset:
         self.info = _read_info(folder)
         keys = [key for key, feature in self.info.features.items() if feature.dtype in IMAGES and not feature.is_depth]
         cameras = [key.removeprefix("observation.").removeprefix("images.") for key in keys]
+        if images is None and len(set(cameras)) < len(cameras):
+            raise UserError(
+                f"two cameras would have one name in {folder}, which has {', '.join(keys)}: name them, as in "
+                f"expert.images={{top: {keys[0]}}}"
+            )
         self.images = dict(zip(cameras, keys, strict=True) if images is None else images)
         if extra_keys := [key for key in self.images.values() if key not in keys]:
             raise UserError(f"expert.images: {folder} has no images {', '.join(extra_keys)}, it has {', '.join(keys)}")

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
+from math import inf
 from pathlib import Path
 
 import av
@@ -21,6 +22,8 @@ from vla.spec import Array
 
 CODEC = "libsvtav1"
 PIXELS = "yuv420p"  # the only layout that the encoder supports
+# How long before a frame decoding starts [s]: in some videos the frames before a key frame need the one before that.
+LEADS = 0.0, 1.0, 10.0, inf
 VIDEO_REMEDY = "copy the video again from where it is whole, or encode it again"
 
 
@@ -74,14 +77,17 @@ def decode(
     next_number = 0
     with _open_video(path) as (file, stream):
         _require_size(path, stream, size)  # before anything is decoded
-        file.seek(round(start / (stream.time_base or 1)), stream=stream)  # the key frame before it
-        for frame in file.decode(stream):
-            _require_size(path, frame, size)
-            number = -1 if frame.time is None else round((frame.time - start) * float(fps))
-            if number == next_number < count:
-                yield frame.to_ndarray(format="rgb24")
-                next_number += every
-            if next_number >= count or number > next_number:
+        for lead in LEADS:
+            file.seek(round(max(start - lead, 0.0) / (stream.time_base or 1)), stream=stream)  # the key frame before it
+            for frame in file.decode(stream):
+                _require_size(path, frame, size)
+                number = -1 if frame.time is None else round((frame.time - start) * float(fps))
+                if number == next_number < count:
+                    yield frame.to_ndarray(format="rgb24")
+                    next_number += every
+                if next_number >= count or number > next_number:
+                    break
+            if next_number >= count:
                 break
     if next_number < count:
         raise UserError(f"{path} lacks the frame at {start + next_number / float(fps):.3f} s: {VIDEO_REMEDY}")

@@ -134,7 +134,7 @@ def words_of(sentence: str) -> list[str]:
 
 def _replacements(synonyms: Mapping[str, Sequence[str]]) -> dict[str, str]:
     """Return words → their replacement, the longest first; replacements are mapped to themselves."""
-    pairs = [(word, term) for term, variants in synonyms.items() for word in (term, *variants) if word]
+    pairs = [(word.lower(), term.lower()) for term, variants in synonyms.items() for word in (term, *variants) if word]
     if duplicates := sorted({word for word, _ in pairs if sum(word == name for name, _ in pairs) > 1}):
         raise UserError(f"model.text.synonyms has {', '.join(map(repr, duplicates))} more than once: omit all but one")
     return dict(sorted(pairs, key=lambda pair: -len(pair[0])))

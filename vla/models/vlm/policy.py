@@ -114,6 +114,8 @@ class VisionLanguageAction(Model):
         _require_width("action", len(spec.action), self.network.action_width)
         self.state_normalizer = Normalizer(normalization, len(spec.pose))
         self.action_normalizer = Normalizer(normalization, len(spec.action))
+        if origin and statistics == "demonstrations" and (difference := origin.other_normalization(normalization)):
+            log.warning("%s, unless its weights are to learn another scale", difference)
         if statistics == "pretrained" and origin:
             trunk_statistics = origin.statistics(normalization)
             self.state_normalizer.take(trunk_statistics, "observation.state", trunk)

@@ -25,6 +25,7 @@ Part = TypeVar("Part")
 PREPROCESSOR = "policy_preprocessor.json"
 NORMALIZER = "normalizer_processor"  # its step that normalises
 IMAGES = "observation.images."
+EMBEDDING = "embed_tokens.weight"  # end of the name of the embedding of words
 KINDS = ("smolvla", "pi0", "pi05")  # of policies of LeRobot
 # Options of LeRobot's policies that change what is computed → values that are supported here. With 0 layers or less the
 # expert has as many as the trunk, and with a length of 0 or less a prefix is not padded: smolvla_base has 0 for both.
@@ -78,19 +79,21 @@ class Trunk:
         features = self._mapping("input_features", dict[str, dict[str, Any]])
         return [name.removeprefix(IMAGES) for name, feature in features.items() if feature.get("type") == "VISUAL"]
 
+    def other_normalization(self, kind: Kind) -> str:
+        """Describe how the policy normalises state and actions in another way than `kind`; "" if it does not."""
+        mapping = self._mapping("normalization_mapping", dict[str, str])
+        modes = {mapping[feature] for feature in ("STATE", "ACTION") if feature in mapping} - {MODES[kind]}
+        names = ", ".join(sorted(modes))
+        return f"{self} normalises by {names}, and model.normalization is {kind}: choose the same" if modes else ""
+
     def statistics(self, kind: Kind) -> dict[str, Tensor]:
         """Return the statistics by which the policy normalises, such as action.mean; empty if it has no normaliser.
 
         Raises:
             UserError: it normalises in another way than `kind`.
         """
-        mapping = self._mapping("normalization_mapping", dict[str, str])
-        modes = {mapping[feature] for feature in ("STATE", "ACTION") if feature in mapping}
-        if rest := modes - {MODES[kind]}:
-            raise UserError(
-                f"{self} normalises by {', '.join(sorted(rest))}, and model.normalization is {kind}: choose the same, "
-                "or model.statistics=demonstrations"
-            )
+        if difference := self.other_normalization(kind):
+            raise UserError(f"{difference}, or model.statistics=demonstrations")
         path = self.folder / PREPROCESSOR
         raw_steps = read_json(path, dict[str, Any]).get("steps", []) if path.is_file() else []
         steps = parse_plain(raw_steps, list[dict[str, Any]], f"steps of {path}")
@@ -111,6 +114,9 @@ class Trunk:
             UserError: a weight is missing, unknown or of another shape, or they need more memory than is free.
         """
         instance = sketch(network)
+        size, own_size = self._config.get("resize_imgs_with_padding"), [instance.resolution] * 2
+        if self.is_policy and size not in (None, own_size):
+            raise UserError(f"{self} sees images of {size} pixels, and the model of {own_size}: choose another model=")
         if any(isinstance(module, ImageEncoder) for module in instance.modules()):
             instance = network()  # such an encoder is small, and may have weights of its own, which a sketch lacks
         parameters = dict(instance.named_parameters())
@@ -118,6 +124,8 @@ class Trunk:
         for key, tensor in _tensors(self._files):
             name = rename_weight(key, instance.published_names if self.is_policy else instance.trunk_names)
             if name in parameters:
+                if name.endswith(EMBEDDING) and not self.is_policy:
+                    tensor = tensor[: len(parameters[name])]  # the rest pads a vocabulary
                 if tensor.shape != parameters[name].shape:
                     shapes = f"{[*tensor.shape]}, and the model has {[*parameters[name].shape]}"
                     raise UserError(f"{key} in {self} has shape {shapes}: choose another model= or model.network")
