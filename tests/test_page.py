@@ -245,7 +245,7 @@ def test_what_is_missing_is_left_out(tmp_path: Path) -> None:
     save_training(tmp_path, Training(1, 39, 3.0, "interrupted"))
     told = text(write_page(tmp_path))
     assert "p Holm" not in told
-    assert f"Training was interrupted after 39 steps; resume={tmp_path} continues it." in told
+    assert f"Training was interrupted after 39 steps; resume={tmp_path} output={tmp_path} continues it." in told
     assert "Rollouts" not in told
 
 

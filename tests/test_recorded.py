@@ -207,10 +207,6 @@ def test_outliers_do_not_widen_the_bounds_and_rare_events_do() -> None:
         (["agent=remote", "agent.images.top=top"], "; +agent.images.top=VALUE adds it"),
         (["validate.episodes=3"], "validate.episodes=3: nothing can be played in a recording"),
         (["job=evaluate", "evaluate.against=nowhere"], "need a success rate, which recordings lack: omit them"),
-        (
-            ["job=evaluate", "recorder=rerun"],
-            "recorder=rerun records what is played in a world, and a recording has none",
-        ),
         (["job=preview"], "the task has no simulator, only recordings, so nothing can be played in it"),
     ],
 )

@@ -564,7 +564,8 @@ def test_a_key_and_images_go_to_the_named_server_only() -> None:
     assert asked == ["Api-Key s3cret"]
 
 
-def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:
+def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VLA_API_KEY", "s3cret")
     common = (*SMALL, "evaluate.episodes=1", "task.time_limit=1", "recorder=none")
     environment = Experiment.from_config(composed(*common)).make_environment()()
     policy = as_policy(make_bc(spec=environment.spec), spec=environment.spec)
@@ -578,10 +579,8 @@ def test_whoever_acts_is_evaluated_by_the_same_job(tmp_path: Path) -> None:
             f"+evaluate.networks.near={network}",
             "+evaluate.conditions.dark={shadows: true}",
         )
-        here(
-            tmp_path, "agent=remote", f"agent.url={url}", "agent.api_key=s3cret", *common, *conditions, "output=remote"
-        )
-    assert not [path for path in (tmp_path / "remote").rglob("*") if path.is_file() and b"s3cret" in path.read_bytes()]
+        here(tmp_path, "agent=remote", f"agent.url={url}", *common, *conditions, "output=remote")
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() and b"s3cret" in path.read_bytes()]
     report = json.loads((tmp_path / "remote/report.json").read_text())
     (played,) = report["per_episode"]
     assert (played["outcome"], played["steps"], played["draws"]) == (expected.outcome, 10, expected.draws)

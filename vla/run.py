@@ -27,9 +27,10 @@ from yaml import YAMLError
 from vla import jobs
 from vla.config.annotations import packages, targets
 from vla.config.check import check, devices
-from vla.config.compose import CONF, copy_less, offer_axes, substitutes, with_variant
+from vla.config.compose import CONF, axes, copy_less, offer_axes, substitutes, with_variant
 from vla.config.compose import compose as compose_again
 from vla.config.experiment import Experiment
+from vla.config.origin import SECRET
 from vla.config.packages import config_folders, offer_options, trust
 from vla.deploy import ros
 from vla.io.errors import UserError, suggestion
@@ -92,12 +93,22 @@ def _choices_hint(name: str, names: Sequence[str]) -> str:
 
 def _unknown_key(error: OmegaConfBaseException) -> str:
     key = str(error.full_key)
+    if key in jobs.JOBS:
+        return f"there is no {key} without job={key}"
     *path, name = str(error.key).replace("/", ".").split(".")
     parent = OmegaConf.select(error.parent_node, ".".join(path)) if path else error.parent_node
     names = [str(key) for key in parent if key not in ("hydra", "_target_")] if isinstance(parent, DictConfig) else []
+    if not names and (group := key.rpartition(".")[0].replace(".", "/")) in _groups():  # a part that is null
+        return f"there is no {key} before {group} is chosen: add {group}=OPTION, see --help"
     hint = _choices_hint(name, names) if names else ""
     # The task of a checkpoint may have other keys than that of the command.
     return f"there is no {key}{hint}" + (f"; +{key}=VALUE adds it" if hint[:1] == ":" or key[:5] == "task." else "")
+
+
+def _groups() -> set[str]:
+    """Return all groups of options."""
+    files = ((folder, file) for folder in config_folders() for file in folder.rglob("*.yaml"))
+    return {*axes(), *(file.parent.relative_to(folder).as_posix() for folder, file in files)}
 
 
 def _is_mendable(error: Exception) -> bool:
@@ -287,6 +298,11 @@ def _require_options(arguments: list[str]) -> None:
         group = name.lstrip("+~").partition("@")[0]
         if argument.startswith("~") and group in ("job", "experiment"):
             raise UserError(f"{argument} leaves no {group}: choose another one, {group}=OPTION")
+        if SECRET in argument and value not in ("", "null"):
+            raise UserError(
+                f"{name} is a secret that Hydra would save in the folder of the run: set the environment variable "
+                "VLA_API_KEY instead"
+            )
         if equals and not name:
             raise UserError(f"{argument} has no key: write KEY{argument}")
         if group in ("job", "experiment") and value.startswith("["):

@@ -170,7 +170,10 @@ def require_identity(
     keys = [key for key, _, _ in differences(old, new)]
     if keys:
         weights = f"; pretrained={folder} starts another from its weights" if (folder / POLICY).exists() else ""
-        way_out = f"choose another output=DIR (hydra.sweep.dir=DIR of a sweep), or continue it with resume={folder}"
+        way_out = (
+            "choose another output=DIR (hydra.sweep.dir=DIR of a sweep), or continue it with "
+            f"resume={folder} output={folder}"
+        )
         raise UserError(
             f"{folder} holds a training that differs in {', '.join(keys[:3])}{', …' if keys[3:] else ''}: "
             f"{'omit that to continue it' if config.get('resume') else way_out}{weights}"

@@ -144,7 +144,11 @@ def mismatch(key: str, value: Any, annotation: Any) -> str:
         return ""
     # Members of a union fail at different depths: the deepest error is the most specific.
     path, part = max((_part_at(value, detail["loc"]) for detail in errors), key=lambda place: len(place[0]))
-    reasons = dict.fromkeys(detail["msg"] for detail in errors if _part_at(value, detail["loc"])[0] == path)
+    reasons = dict.fromkeys(
+        "longer" if detail["type"] == "missing" else detail["msg"]
+        for detail in errors
+        if _part_at(value, detail["loc"])[0] == path
+    )
     words = [re.sub(r"^\w+ should (be )?| after validation.*", "", text).replace("None", "null") for text in reasons]
     verb = "must" if words[0].startswith(("have ", "match ")) else "must be"
     sentence = f"{key}{path} {verb} {' or '.join(words)}, got {format_short(part)}"

@@ -57,7 +57,7 @@ class EpisodeStore:
         fields: field → its files, see `fields_of`.
         row_size: size of a decoded row in all fields together [bytes].
         codec: of the images.
-        tried: one entry per seed.
+        attempts: one entry per seed.
         episodes: entries of the stored episodes, successes and labelled failures; at most `episodes`.
 
     Args:

@@ -39,6 +39,8 @@ def write_comparison(
     for row in rows:
         single = len(row.runs) == 1
         cells += [(row.name if single else run.folder.name, legend[row.name], run) for run in row.runs]
+    if len({name for name, _, _ in cells}) < len(cells):  # a row's name may be the number of another row's cell
+        cells = [(run.folder.name, colour, run) for _, colour, run in cells]
     shown_runs = {name: run for name, _, run in cells} if len(cells) <= len(COLOURS) else {}
     parts = [
         results_table(rows, page.parent),

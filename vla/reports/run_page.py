@@ -83,7 +83,10 @@ def _warning(run: Run) -> str:
         return ""
     if training.ended != "interrupted":
         return f"Training failed: {training.ended}"
-    return f"Training was interrupted after {counted(training.steps, 'step')}; resume={_path(run.folder)} continues it."
+    is_round = re.fullmatch(r"round_\d+", run.folder.name) is not None
+    path = _path(run.folder.parent if is_round else run.folder)
+    steps = counted(training.steps, "step")
+    return f"Training was interrupted after {steps}; resume={path} output={path} continues it."
 
 
 def _path(path: Path, *folders: Path) -> Path:
