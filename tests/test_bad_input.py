@@ -54,6 +54,7 @@ BAD_INPUT = {
     "=3": "=3 has no key: write KEY=3",
     "agent=remote agent.api_key=x": "agent.api_key is a secret that Hydra would save in the folder of the run: set the",
     "improve.rounds=3": "there is no improve without job=improve",
+    "deploy=server checkpoint=x": "deploy=OPTION goes with job=deploy: add that",
     "task.randomize.latency.seconds=[0,0.1]": "before task/randomize/latency is chosen: add task/randomize/latency=",
     "job=inspect inspect.seed=0": "there is no inspect.seed: there are folder, stores, where",
     "--resolve": "--resolve goes with --cfg job",

@@ -101,6 +101,15 @@ def test_seeds_are_put_together_and_the_rest_is_told_apart(tmp_path: Path, figur
     assert not list(tmp_path.glob(".*"))
 
 
+def test_no_run_is_lost_where_the_choices_are_numbers_like_those_of_cells(tmp_path: Path) -> None:
+    for number, (seed, history) in enumerate([(0, 1), (0, 2), (1, 1)]):  # a fourth cell failed
+        cell(tmp_path, number, [f"seed={seed}", f"model.context.history={history}"], 5, config={"seed": seed})
+    assert [row.name for row in tabulate(tmp_path)] == ["1", "2"]
+    page = (tmp_path / "sweep.html").read_text()
+    differences = re.sub(r"<[^>]*>", " ", page[page.index("Differences in configuration") :])
+    assert "key 0 2 1 seed 0 1 0" in " ".join(differences.split())
+
+
 def test_the_console_has_a_row_per_choice_and_of_many_conditions_the_first(tmp_path: Path) -> None:
     cell(tmp_path, 0, ["model=bc"], 9)
     cell(tmp_path, 1, ["model=[rt1]"], 7, dark=0)

@@ -292,7 +292,12 @@ def _require_plain(arguments: list[str]) -> None:
 
 
 def _require_options(arguments: list[str]) -> None:
-    """Refuse arguments at which Hydra shows a traceback, such as a value where a group takes an option, or no job."""
+    """Refuse arguments at which Hydra shows a traceback, such as a value where a group takes an option, or no job, and
+    those that the default job would ignore."""
+    names = {argument.partition("=")[0].lstrip("+~") for argument in arguments}
+    for group in ("deploy", "export"):
+        if group in names and not names & {"job", "experiment", "resume"}:
+            raise UserError(f"{group}=OPTION goes with job={group}: add that")
     for argument in arguments:
         name, equals, value = argument.partition("=")
         group = name.lstrip("+~").partition("@")[0]
