@@ -255,7 +255,7 @@ class Policy:
             rest = running.actions[: self.model.chunk]
             padded = np.zeros((self.model.chunk, len(self._low)), np.float32)
             padded[: len(rest)] = rest
-            counts = {"remaining": len(rest), "delay": min(self._known_delay(running.delay), len(rest))}
+            counts = {"remaining": len(rest), "delay": self._known_delay(min(running.delay, len(rest)))}
             inputs |= {name: torch.tensor([count], device=self.device) for name, count in counts.items()}
             inputs["running"] = torch.from_numpy(padded)[None].to(self.device)
         return inputs

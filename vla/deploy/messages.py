@@ -126,11 +126,9 @@ class JointStates:
     def _opening(self, fingers: Array) -> float:
         """Return the opening [m] at positions of all fingers; 0 without any."""
         limits = self._limits
-        return (
-            (limits.widest or 0.0) * limits.opening(dict(zip(limits.fingers, fingers, strict=True)))
-            if len(fingers)
-            else 0.0
-        )
+        if not limits.fingers or limits.widest is None:
+            return 0.0
+        return limits.widest * limits.opening(dict(zip(limits.fingers, fingers, strict=True)))
 
 
 def _positions(message: Any, joints: Sequence[str]) -> tuple[Array, Array]:
