@@ -72,10 +72,13 @@ def episode(seed: int) -> Episode:
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A LeRobot dataset of a robot that nobody here knows."""
-    folder = tmp_path_factory.mktemp("recorded")
+    return exported(tmp_path_factory.mktemp("recorded"), range(EPISODES))
+
+
+def exported(folder: Path, seeds: range) -> Path:
     store = EpisodeStore.create_or_open(folder / "store", SPEC, {})
     with store.writing():
-        for seed in range(EPISODES):
+        for seed in seeds:
             store.append(episode(seed))
     made = Path(exporter("lerobot", folder / "dataset", "export.crf=5").export(store))
     (made / "meta/checksums.json").unlink()
@@ -273,6 +276,23 @@ def test_a_policy_of_another_size_of_images_is_trained_further_and_evaluated(dat
     assert read_policy(tmp_path / "second").spec.image_size == (24, 32)
     errors = json.loads((tmp_path / "second/errors.json").read_text())
     assert errors["seeds"] == [seed for seed in range(EPISODES) if is_held_out(seed, 0.2)]
+
+
+def test_a_policy_keeps_its_bounds_when_it_is_trained_further_on_another_recording(
+    dataset: Path, tmp_path: Path
+) -> None:
+    here(tmp_path, *small(dataset), *TRAINING, *TINY, "job=train", "hydra.run.dir=run", "output=run")
+    other = small(exported(tmp_path / "other", range(3)))
+    first, second = (
+        build(to_plain(composing.composed(*part))["task"], "task").spec for part in (small(dataset), other)
+    )
+    assert first.low != second.low and first.high != second.high
+    options = (*TRAINING, "job=train", "pretrained=run", "output=second", "hydra.run.dir=second")
+    here(tmp_path, *other, *options)
+    policy = read_policy(tmp_path / "second")
+    assert policy.spec.high == first.high
+    told = here(tmp_path, *other, *options, f"task.high={list(second.high)}", "output=third", ok=False)
+    assert "high" in told.stderr and "the policy" in told.stderr
 
 
 def test_a_training_on_all_episodes_ends_with_success_and_is_complete(dataset: Path, tmp_path: Path) -> None:

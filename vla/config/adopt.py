@@ -76,14 +76,19 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
         )
     if is_trunk(cfg.pretrained):
         return _with_trunk(cfg)
-    saved_config, in_rounds = read_policy(cfg.pretrained).config, cfg.job == "improve"  # first, to report a wrong path
+    policy, in_rounds = read_policy(cfg.pretrained), cfg.job == "improve"  # first, to report a wrong path
+    saved_config = policy.config
     parsed = _parse(overrides, ("tokenizer", "model", "experiment"))
     parts = (*REQUIRED_NODES, *TRAINING_KEYS) if in_rounds else ("tokenizer", "model", "data")
     require_no_paths(saved_config, parts, cfg.pretrained, _replaced_paths(parsed) if in_rounds else None)
     values = _values(saved_config, parts)
     if "seed" in values.get("data", {}):
         values["data"] = {**values["data"], "seed": "${seed}"}  # of the new training: it orders the windows
-    return _merge(cfg, values | _chosen_options(saved_config, "model"), parsed)
+    config = _merge(cfg, values | _chosen_options(saved_config, "model"), parsed)
+    for name in ("low", "high"):  # bounds that follow from another recording would not be those of the weights
+        if OmegaConf.is_interpolation(config.task, name) and len(config.task.action) == len(policy.spec.action):
+            config.task[name] = list(getattr(policy.spec, name))
+    return config
 
 
 def _with_trunk(cfg: DictConfig) -> DictConfig:
