@@ -166,7 +166,7 @@ def test_the_folder_of_a_training_without_rounds_is_left_alone(tmp_path: Path) -
     "change",
     [
         *("seed=1", "trainer.max_steps=5", "+trainer.max_time={hours: 1}", "policy.lanes=2"),
-        *("improve.steps=5", "improve.episodes=3", "improve.seed=7"),
+        *("improve.steps=5", "improve.episodes=3", "improve.seed=700000"),
     ],
 )
 def test_a_folder_with_other_rounds_or_longer_trainings_is_left_alone(tmp_path: Path, change: str) -> None:

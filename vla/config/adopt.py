@@ -85,9 +85,12 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
     if "seed" in values.get("data", {}):
         values["data"] = {**values["data"], "seed": "${seed}"}  # of the new training: it orders the windows
     config = _merge(cfg, values | _chosen_options(saved_config, "model"), parsed)
-    for name in ("low", "high"):  # bounds that follow from another recording would not be those of the weights
-        if OmegaConf.is_interpolation(config.task, name) and len(config.task.action) == len(policy.spec.action):
-            config.task[name] = list(getattr(policy.spec, name))
+    derived = [
+        name for name in ("low", "high") if name in config.task and OmegaConf.is_interpolation(config.task, name)
+    ]
+    if derived and len(config.task.action) == len(policy.spec.action):
+        # Bounds that follow from another recording would not be those of the weights.
+        config.task.update({name: list(getattr(policy.spec, name)) for name in derived})
     return config
 
 
