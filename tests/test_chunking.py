@@ -27,7 +27,7 @@ from toy import SPEC, ToyEnvironment, make_environment
 from vla.config.build import build
 from vla.config.experiment import Experiment
 from vla.jobs.evaluate import require_possible
-from vla.models.chunking import Chunking, Guided, RunningPlans, TrainedPrefix, require_fit
+from vla.models.chunking import Chunking, Guided, RunningPlans, TrainedPrefix, Velocity, require_fit
 from vla.models.flow import Flow
 from vla.models.vlm.policy import VisionLanguageAction
 from vla.rollouts.realtime import Network, NetworkedAgent, make_networked
@@ -140,13 +140,19 @@ def test_a_plan_begins_with_what_is_executed_until_it_arrives(method: Callable[[
 
 def test_a_delay_beyond_the_trained_prefix_is_limited_to_it_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     model, (first, second, *_) = make_flow(prefix=2), observations(2)
-    policy, given = as_policy(model, chunking=TrainedPrefix()), list[list[int]]()
+    given = list[int]()
+
+    class Watched(TrainedPrefix):
+        def continuing_velocity(self, velocity: Velocity, running: RunningPlans) -> Velocity:
+            given.append(int(running.delay))
+            return super().continuing_velocity(velocity, running)
+
+    policy = as_policy(model, chunking=Watched())
     plan = policy.plan(first)
-    model.predict = lambda batch: given.append(batch["delay"].tolist()) or Flow.predict(model, batch)  # type: ignore[method-assign]
-    policy._predict_chunk = model.predict
+    given.clear()
     for delay in (2, 3, 5):
         policy.plan(replace(second, running=RunningPlan(plan[3:], delay)))
-    assert given == [[2], [2], [2]]
+    assert given == [2, 2, 2]
     assert [record.getMessage() for record in caplog.records] == [
         "a plan arrives 3 actions late, more than model.prefix=2 of its training: it may not continue the running one; "
         "train with a larger one"

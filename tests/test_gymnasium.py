@@ -173,6 +173,7 @@ def test_what_the_command_line_names_is_trusted_and_what_a_file_names_is_not(
         with pytest.raises(ValueError, match=rf"package cannot name {name!r}: give the name by which a package is"):
             packages.trust([], [], [name])
     packages.trust([], [], ["gymnasium"])
+    assert not packages.is_trusted("gymnasium.vector.SyncVectorEnv")
     with pytest.raises(ValueError, match=r"task\.id=Pendulum-v1 cannot be played"):  # which draws by pygame
         build(
             node(package="gymnasium", id="Pendulum-v1", images={"above": "render"}, state={"observation": None}), "task"

@@ -43,11 +43,12 @@ def test_a_video_leaves_the_priority_of_all_threads(tmp_path: Path) -> None:
 
 
 def test_frames_before_a_key_frame_are_found_though_they_need_the_one_before_it(tmp_path: Path) -> None:
-    """In open groups of pictures, which HEVC has by default."""
-    path, options = tmp_path / "video.mp4", {"x264-params": "open-gop=1:keyint=5:min-keyint=5:scenecut=0:bframes=3"}
+    """In open groups of pictures, as encoders of HEVC write them."""
+    path, options = tmp_path / "video.mp4", {"g": "8", "x264-params": "open-gop=1:bframes=3:b-adapt=0:scenecut=0"}
     with av.open(path, "w", format="mp4") as file:
         stream = file.add_stream("libx264", rate=10, options=options)
         stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+        stream.codec_context.max_b_frames = 3
         for level in range(20, 200, 5):
             file.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((64, 64, 3), level, np.uint8), format="rgb24")))
         file.mux(stream.encode(None))

@@ -470,6 +470,10 @@ REFUSED: list[tuple[Change, str]] = [
     (lambda dataset: shutil.rmtree(dataset), r"no LeRobot dataset in .*dataset \(no meta/info\.json\)"),
     (told(codebase_version="v2.1"), r"info\.json has version v2\.1, and v3\.0 is read here: convert an older dataset"),
     (told(codebase_version=["v3.0"] * 1000), r"has version \['v3\.0', .{1,12}, and v3\.0 is read here"),
+    (
+        info(lambda info: info["features"].update({"observation.front": info["features"][FRONT]})),
+        r"two cameras would have one name in .*: name them, as in expert\.images=\{top: ",
+    ),
     (info(lambda info: info.pop("features")), r"info\.json is damaged or of another kind: features: Field required"),
     (told(fps=0), r"fps: Input should be greater than 0"),
     (told(features=feature("action", [3], [5])), r"no vector observation\.state, it has act"),

@@ -98,17 +98,12 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
     *path, name = str(error.key).replace("/", ".").split(".")
     parent = OmegaConf.select(error.parent_node, ".".join(path)) if path else error.parent_node
     names = [str(key) for key in parent if key not in ("hydra", "_target_")] if isinstance(parent, DictConfig) else []
-    if not names and (group := key.rpartition(".")[0].replace(".", "/")) in _groups():  # a part that is null
+    group = key.rpartition(".")[0].replace(".", "/")
+    if not names and (group in axes() or any((folder / group).is_dir() for folder in config_folders())):
         return f"there is no {key} before {group} is chosen: add {group}=OPTION, see --help"
     hint = _choices_hint(name, names) if names else ""
     # The task of a checkpoint may have other keys than that of the command.
     return f"there is no {key}{hint}" + (f"; +{key}=VALUE adds it" if hint[:1] == ":" or key[:5] == "task." else "")
-
-
-def _groups() -> set[str]:
-    """Return all groups of options."""
-    files = ((folder, file) for folder in config_folders() for file in folder.rglob("*.yaml"))
-    return {*axes(), *(file.parent.relative_to(folder).as_posix() for folder, file in files)}
 
 
 def _is_mendable(error: Exception) -> bool:
@@ -305,7 +300,7 @@ def _require_options(arguments: list[str]) -> None:
             raise UserError(f"{argument} leaves no {group}: choose another one, {group}=OPTION")
         if SECRET in argument and value not in ("", "null"):
             raise UserError(
-                f"{name} is a secret that Hydra would save in the folder of the run: set the environment variable "
+                f"{name}: Hydra would save the {SECRET} in the folder of the run: set the environment variable "
                 "VLA_API_KEY instead"
             )
         if equals and not name:

@@ -23,7 +23,7 @@ from annotated_types import MinLen, Predicate
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError
 
-from vla.config.packages import GYMNASIUM, can_be_trusted, is_trusted
+from vla.config.packages import can_be_trusted, is_trusted
 from vla.io.documents import mappings
 from vla.io.errors import UserError, suggestion
 
@@ -93,8 +93,6 @@ def require_trusted(source: object, target: Any, is_package: bool = False) -> No
     `is_package`: `target` is itself the name of a package to import.
     """
     if not isinstance(target, str) or target.startswith(OWN_PREFIX) or target in LIBRARY or is_trusted(target):
-        return
-    if is_package and target == GYMNASIUM:
         return
     package, dot, _ = target.partition(".")
     if is_package or (dot and can_be_trusted(package)):

@@ -23,7 +23,7 @@ import vla.config.resolvers  # noqa: F401  registers them
 from vla.config.annotations import is_node, locate, packages
 from vla.config.build import check_value
 from vla.config.experiment import Node, make_environment, to_plain
-from vla.config.packages import CONF, GYMNASIUM, MISSING, offer_options, trusting
+from vla.config.packages import CONF, MISSING, offer_options, trusting
 from vla.io.documents import read_yaml
 from vla.io.errors import UserError, suggestion
 from vla.spec import Environment
@@ -98,7 +98,7 @@ def compose_task(task: str, **overrides: Any) -> Node:
 def make_task(task: str, **overrides: Any) -> Environment:
     """Build a task, see `compose_task`. The package that a task of gymnasium names is trusted: the caller chose it."""
     node = compose_task(task, **overrides)
-    with trusting([name for name in packages(node) if name not in (MISSING, GYMNASIUM)]):
+    with trusting([name for name in packages(node) if name != MISSING]):
         return make_environment(node)
 
 

@@ -27,7 +27,7 @@ TRUST = "VLA_TRUST"  # environment variable of the user: packages, separated by 
 TRUSTED = "VLA_TRUSTED"  # environment variable that passes trusted packages and classes to child processes
 ENTRY_POINTS = "vla.conf"
 MISSING = "???"  # a value that the command line must give
-GYMNASIUM = "gymnasium"  # the package whose own environments need no trust
+GYMNASIUM = "gymnasium"  # the package whose own environments need no trust; its classes cannot be trusted
 PACKAGE = Path(__file__).resolve().parents[1]
 # Options of `vla` itself: inside the package if installed from a wheel, beside it in a clone.
 CONF = next(path for path in (PACKAGE / "conf", PACKAGE.parent / "conf") if (path / "config.yaml").is_file())
@@ -91,7 +91,7 @@ def trust(packages: Any, targets: Iterable[Any], node_packages: Iterable[Any] = 
     """
     if not isinstance(packages, list):
         raise UserError(f"trust must be a list of packages, as in trust=[mypackage], got {packages!r}")
-    node_packages = [name for name in node_packages if name not in (MISSING, GYMNASIUM)]
+    node_packages = [name for name in node_packages if name != MISSING]
     names = [*packages, *_names(TRUST), *node_packages]
     for name in names:
         _require_trustworthy("package" if name in node_packages else "trust", name)
@@ -124,12 +124,14 @@ def trusted_names() -> list[str]:
 
 def is_trusted(target: Any) -> bool:
     """Return whether the third-party class or package `target` may be used."""
+    if target == GYMNASIUM:
+        return True
     matches = isinstance(target, str) and any(f"{target}.".startswith(f"{name}.") for name in trusted_names())
     return matches and can_be_trusted(target.partition(".")[0])
 
 
 def _require_trustworthy(key: str, name: Any) -> None:
-    if not isinstance(name, str) or not can_be_trusted(name):
+    if name != GYMNASIUM and (not isinstance(name, str) or not can_be_trusted(name)):
         raise UserError(
             f"{key} cannot name {name!r}: give the name by which a package is imported, without a submodule; the "
             "package must depend on vla or gymnasium"

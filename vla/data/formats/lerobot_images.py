@@ -10,7 +10,6 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
-from math import inf
 from pathlib import Path
 
 import av
@@ -23,7 +22,7 @@ from vla.spec import Array
 CODEC = "libsvtav1"
 PIXELS = "yuv420p"  # the only layout that the encoder supports
 # How long before a frame decoding starts [s]: in some videos the frames before a key frame need the one before that.
-LEADS = 0.0, 1.0, 10.0, inf
+LEADS = 0.0, 1.0, 10.0
 VIDEO_REMEDY = "copy the video again from where it is whole, or encode it again"
 
 
