@@ -23,16 +23,16 @@ def fetch(name: str, *patterns: str, advice: str = "") -> Path:
         UserError: there is no such model, or the hub is unreachable and the model is not cached.
     """
     from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+    from huggingface_hub.errors import HFValidationError, RepositoryNotFoundError, RevisionNotFoundError
 
     reason, (repository, _, revision) = _connection_problem(), name.removeprefix(HUB).partition("@")
     try:
         options = {"local_files_only": reason is not None}
         return Path(snapshot_download(repository, revision=revision or None, allow_patterns=list(patterns), **options))
-    except (HfHubHTTPError, HFValidationError, OSError) as error:
+    except (HFValidationError, OSError) as error:
         if isinstance(error, HFValidationError):
             reason = "models are called OWNER/NAME there"
-        elif isinstance(error, HfHubHTTPError):
+        elif isinstance(error, RepositoryNotFoundError | RevisionNotFoundError):
             reason = f"it has no public model {repository}{f' at {revision}' if revision else ''}"
         reason = reason or str(error).partition("\n")[0]
         advice = advice and f"; {advice}"
