@@ -30,7 +30,7 @@ from vla.jobs.evaluate import require_possible
 from vla.models.chunking import Chunking, Guided, RunningPlans, TrainedPrefix, Velocity, require_fit
 from vla.models.flow import Flow
 from vla.models.vlm.policy import VisionLanguageAction
-from vla.rollouts.realtime import Network, NetworkedAgent, make_networked
+from vla.rollouts.realtime import Network, NetworkedAgent
 from vla.rollouts.rollout import AgentFactory, rollout
 from vla.rollouts.shared_policy import shared_policy
 from vla.schedule import Delays, Schedule
@@ -246,7 +246,7 @@ class Watched:
 def test_over_a_network_the_arm_does_what_every_plan_begins_with(method: Callable[[], Chunking]) -> None:
     """The second observation is sent at step 2, then at 5, 8 …, each time when the plan of the one before arrives."""
     agent = Watched(method())
-    distant = NetworkedAgent(agent, NETWORK, SPEC)
+    distant = NetworkedAgent(lambda _: agent, NETWORK, ToyEnvironment())
     distant.reset("", 3)
     acted = [distant.act(seen) for seen in observations(20)]
     starts = [0, 2, 5, 8, 11, 14, 17]
@@ -266,7 +266,7 @@ def test_episodes_over_a_network_are_repeatable_wherever_the_policy_is() -> None
     policy = as_policy(make_flow(), chunking=TrainedPrefix(), lanes=2)
 
     def executed(make_agent: AgentFactory) -> Array:
-        with closing(make_networked(make_agent, NETWORK, make_environment())) as agent:
+        with closing(NetworkedAgent(make_agent, NETWORK, make_environment())) as agent:
             return rollout(make_environment(), agent, FIRST_SEED).executed
 
     beside = executed(lambda _: policy)

@@ -28,7 +28,7 @@ from vla.models.policy_folder import read_policy
 from vla.parallel.pool import Cluster
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import replay, rollout
-from vla.rollouts.supervised import SupervisedAgent, make_supervised, require_memoryless
+from vla.rollouts.supervised import SupervisedAgent, require_memoryless
 from vla.runs.folder import save_config
 from vla.tasks.perturb import Perturbed
 from vla.tasks.tabletop.expert import Waypoint
@@ -40,7 +40,7 @@ FEW += ("task.image_size=[40,48]", "cluster.policy=here")  # sharper cameras tha
 
 def label(folder: Path, workers: int, episodes: int = 12) -> EpisodeStore:
     store = EpisodeStore.create_or_open(folder, toy.SPEC, {})
-    agent = partial(make_supervised, toy.make_wanderer, toy.make_expert)
+    agent = partial(SupervisedAgent, toy.make_wanderer, toy.make_expert)
     collect(store, toy.make_environment, agent, episodes, Cluster(workers, "beside"), 100, keep_failures=True)
     return EpisodeStore(folder)
 
@@ -52,7 +52,8 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> EpisodeStore:
 
 
 def test_the_policy_acts_and_the_expert_labels() -> None:
-    episode = rollout(toy.make_environment(), SupervisedAgent(toy.Wanderer(), toy.ToyExpert()), 7)
+    environment = toy.make_environment()
+    episode = rollout(environment, SupervisedAgent(toy.make_wanderer, toy.make_expert, environment), 7)
     alone = rollout(toy.make_environment(), toy.Wanderer(), 7)
     np.testing.assert_array_equal(episode.executed, alone.executed)
     assert not episode.success

@@ -373,7 +373,8 @@ def test_the_planner_goes_on_from_where_another_agent_led() -> None:
 
     with closing(world("object 1")) as environment, environment.blind():
         planner, restless = (Planner(spec=environment.spec) for _ in range(2))
-        episode = rollout(environment, SupervisedAgent(Restless(restless), planner), 2, all_images=False)
+        agent = SupervisedAgent(lambda _: Restless(restless), lambda _: planner, environment)
+        episode = rollout(environment, agent, 2, all_images=False)
         assert episode.success
         led = (episode.executed != episode.actions).any(axis=1)
         assert 0.1 < led.mean() < 0.5

@@ -36,26 +36,26 @@ class Noting(toy.ToyExpert):
 
 def test_without_images_all_is_grey_and_without_an_instruction_nothing_is_said() -> None:
     environment, agent = RecordableEnvironment(), Noting()
-    seen = rollout(environment, AgentWithoutModality(agent, "images", environment.spec), FIRST_SEED).observations[0]
+    blind = AgentWithoutModality(lambda _: agent, "images", environment)
+    seen = rollout(environment, blind, FIRST_SEED).observations[0]
     for blind in agent.seen:
         assert all((image == 128).all() for image in blind.rgb.values())
         assert not any(image.any() for image in blind.depth.values())
     assert agent.seen[0].rgb.keys() == seen.rgb.keys() and agent.seen[0].instruction == agent.heard == seen.instruction
     assert np.array_equal(agent.seen[0].state, seen.state)
-    rollout(environment, AgentWithoutModality(agent, "instruction", environment.spec), FIRST_SEED)
+    rollout(environment, AgentWithoutModality(lambda _: agent, "instruction", environment), FIRST_SEED)
     assert agent.heard == agent.seen[0].instruction == ""
     assert np.array_equal(agent.seen[0].rgb["front"], seen.rgb["front"])
-    rollout(environment, AgentWithoutModality(agent, "both", environment.spec), FIRST_SEED)
+    rollout(environment, AgentWithoutModality(lambda _: agent, "both", environment), FIRST_SEED)
     assert agent.heard == agent.seen[0].instruction == "" and (agent.seen[0].rgb["front"] == 128).all()
     assert np.array_equal(agent.seen[0].state, seen.state)
 
 
 @pytest.mark.parametrize("modality", ["images", "both", "instruction"])
 def test_images_are_rendered_only_where_the_policy_reads_them(modality: Modality) -> None:
-    agent = AgentWithoutModality(as_policy(make_act(chunk=4, execute=2)), modality, toy.SPEC)
-    every, some = (
-        rollout(toy.make_environment(), agent, FIRST_SEED, all_images=complete) for complete in (True, False)
-    )
+    policy, environment = as_policy(make_act(chunk=4, execute=2)), toy.make_environment()
+    agent = AgentWithoutModality(lambda _: policy, modality, environment)
+    every, some = (rollout(environment, agent, FIRST_SEED, all_images=complete) for complete in (True, False))
     assert np.array_equal(every.executed, some.executed)
     rendered = [step for step, seen in enumerate(some.observations) if seen.rgb]
     assert rendered == ([*range(0, len(some.observations), 2)] if modality == "instruction" else [0])

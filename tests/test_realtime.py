@@ -20,7 +20,6 @@ from vla.rollouts.realtime import (
     NetworkedAgent,
     RealTime,
     SimulatedLink,
-    make_networked,
     weighted_mean,
 )
 from vla.rollouts.rollout import rollout
@@ -67,7 +66,7 @@ def moves(actions: list[Array]) -> list[float]:
 
 
 def acted(network: Network, chunk: int, execute: int, steps: int, seed: int = 0) -> list[float]:
-    agent = NetworkedAgent(Counting(chunk, execute), network, SPEC)
+    agent = NetworkedAgent(lambda _: Counting(chunk, execute), network, toy.ToyEnvironment(spec=SPEC))
     agent.reset("", seed)
     return moves([agent.act(SEEN) for _ in range(steps)])
 
@@ -124,17 +123,17 @@ def test_chunks_for_the_same_step_are_averaged_with_the_oldest_first() -> None:
 
 
 def test_an_evaluation_without_latency_is_that_of_the_policy_and_with_latency_repeatable() -> None:
-    model = make_act(chunk=4, execute=2)
+    model, environment = make_act(chunk=4, execute=2), toy.make_environment()
 
     def executed(network: Network) -> Array:
-        agent = NetworkedAgent(as_policy(model), network, toy.SPEC)
-        return rollout(toy.make_environment(), agent, FIRST_SEED).executed
+        agent = NetworkedAgent(lambda _: as_policy(model), network, environment)
+        return rollout(environment, agent, FIRST_SEED).executed
 
-    expected = rollout(toy.make_environment(), as_policy(model), FIRST_SEED).executed
+    expected = rollout(environment, as_policy(model), FIRST_SEED).executed
     np.testing.assert_array_equal(executed(network_of(0.0)), expected)
     late = executed(network_of(0.2, 0.1, 0.1))
-    agent = NetworkedAgent(as_policy(model), network_of(0.2, 0.1, 0.1), toy.SPEC)
-    partly = rollout(toy.make_environment(), agent, FIRST_SEED, all_images=False)
+    agent = NetworkedAgent(lambda _: as_policy(model), network_of(0.2, 0.1, 0.1), environment)
+    partly = rollout(environment, agent, FIRST_SEED, all_images=False)
     np.testing.assert_array_equal(partly.executed, late)
     assert 0 < sum(bool(seen.rgb) for seen in partly.observations) < len(partly.observations)
     np.testing.assert_array_equal(late, executed(network_of(0.2, 0.1, 0.1)))
@@ -153,7 +152,7 @@ def test_by_the_clock_a_chunk_goes_on_while_the_next_one_is_under_way() -> None:
 def test_latency_costs_steps_and_then_success() -> None:
     seeds = range(FIRST_SEED, FIRST_SEED + 10)
     at_once, late, later = (
-        evaluate(toy.make_environment, partial(make_networked, toy.make_expert, network_of(latency)), None, seeds)
+        evaluate(toy.make_environment, partial(NetworkedAgent, toy.make_expert, network_of(latency)), None, seeds)
         for latency in (0.0, 0.1, 0.4)
     )
     assert at_once == evaluate(toy.make_environment, toy.make_expert, None, seeds)
@@ -172,7 +171,7 @@ def test_an_arm_that_waits_stands_still_and_keeps_its_grip() -> None:
 def test_an_agent_with_a_history_sees_every_frame() -> None:
     agent = Counting(3, 3)
     agent.history = 2  # type: ignore[attr-defined]
-    distant = NetworkedAgent(agent, network_of(0.0), SPEC)
+    distant = NetworkedAgent(lambda _: agent, network_of(0.0), toy.ToyEnvironment(spec=SPEC))
     distant.reset("", 0)
     for _ in range(4):
         distant.act(SEEN)

@@ -34,8 +34,8 @@ from vla.reports.result_tables import conditions_table, plot_conditions, seconda
 from vla.reports.run_page import write_page
 from vla.rollouts.comparison import compare_conditions
 from vla.rollouts.evaluate import evaluate
-from vla.rollouts.memorisation import make_agent_without, make_nearest, open_memory
-from vla.rollouts.realtime import make_networked
+from vla.rollouts.memorisation import AgentWithoutModality, make_nearest, open_memory
+from vla.rollouts.realtime import NetworkedAgent
 from vla.rollouts.recordings import clear_recordings, keep_pictures, merge_recordings
 from vla.rollouts.results import Report
 from vla.rollouts.rollout import AgentFactory, EnvironmentFactory
@@ -171,11 +171,11 @@ def _conditions(experiment: Experiment, make_agent: AgentFactory) -> dict[str, t
         if with_changes(experiment["task"], changes) != experiment["task"]:
             conditions[name] = experiment.make_environment(changes), make_agent
     for modality in options.without:
-        conditions[f"without_{modality}"] = world, partial(make_agent_without, make_agent, modality)
+        conditions[f"without_{modality}"] = world, partial(AgentWithoutModality, make_agent, modality)
     if options.nearest:
         conditions[NEAREST] = world, partial(make_nearest, Path(options.nearest).resolve())
     for name, node in options.networks.items():
-        conditions[name] = world, partial(make_networked, make_agent, build(node, NETWORK))
+        conditions[name] = world, partial(NetworkedAgent, make_agent, build(node, NETWORK))
     return conditions
 
 

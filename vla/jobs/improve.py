@@ -30,7 +30,7 @@ from vla.jobs.train import train
 from vla.models.policy_folder import read_policy
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import close_agent
-from vla.rollouts.supervised import make_supervised, require_memoryless
+from vla.rollouts.supervised import SupervisedAgent, require_memoryless
 from vla.runs.folder import EPISODES, archive_evaluation, read_report, read_run, save_config
 from vla.runs.resume import LENGTHS, training_lock
 from vla.spec import FIRST_SEED
@@ -148,7 +148,7 @@ def _labelled_store(experiment: Experiment, checkpoint: Path, folder: Path, seed
     world.close()
     store = EpisodeStore.create_or_open(folder, world.spec, nodes, experiment.collect.codec)
     with agents_for_workers(experiment, checkpoint) as make_policy:
-        agent = partial(make_supervised, make_policy, experiment.make_expert())
+        agent = partial(SupervisedAgent, make_policy, experiment.make_expert())
         collect(store, environment, agent, options.episodes, experiment.cluster(), seed, keep_failures=True)
     return EpisodeStore(folder)
 

@@ -15,7 +15,7 @@ from vla.io.images import resize
 from vla.io.types import Count
 from vla.rollouts.rollout import AgentFactory, close_agent
 from vla.rollouts.worlds import as_agents
-from vla.spec import Agent, Array, Environment, Observation, Spec
+from vla.spec import Array, Environment, Observation, Spec
 
 Modality = Literal["images", "instruction", "both"]
 
@@ -26,9 +26,9 @@ STRIDE = 4  # of the pixels that are compared
 class AgentWithoutModality:
     """An agent whose images are grey and without depth, or whose instruction is empty, or both."""
 
-    def __init__(self, agent: Agent, modality: Modality, spec: Spec) -> None:
-        """Hide a modality from an agent, in an environment with a spec."""
-        self._agent, self._missing = agent, modality
+    def __init__(self, make_agent: AgentFactory, modality: Modality, environment: Environment) -> None:
+        """Hide a modality from the agent that a factory makes for the environment."""
+        self._agent, self._missing, spec = make_agent(environment), modality, environment.spec
         self._rgb = {camera: np.full((*spec.image_size, 3), GREY, np.uint8) for camera in spec.cameras}
         self._depth = {camera: np.zeros(spec.image_size, np.uint16) for camera in spec.depth}
         self.info: dict[str, Any] = {}
@@ -55,11 +55,6 @@ class AgentWithoutModality:
     def close(self) -> None:
         """Close the agent."""
         close_agent(self._agent)
-
-
-def make_agent_without(make_agent: AgentFactory, modality: Modality, environment: Environment) -> AgentWithoutModality:
-    """Build an agent without a modality for an environment."""
-    return AgentWithoutModality(make_agent(environment), modality, environment.spec)
 
 
 class NearestDemonstration:

@@ -19,7 +19,7 @@ import numpy as np
 from vla.io.types import NonNegative, Rate
 from vla.rollouts.rollout import AgentFactory, close_agent
 from vla.schedule import Delays, Schedule
-from vla.spec import Agent, Array, Environment, Observation, RunningPlan, Spec
+from vla.spec import Array, Environment, Observation, RunningPlan, Spec
 
 Plan = Callable[[Observation], Array]  # returns a chunk (k, D)
 
@@ -208,8 +208,9 @@ class BackgroundLink:
 class NetworkedAgent:
     """An agent at the other end of a simulated network; one that does not plan chunks has chunks of one action."""
 
-    def __init__(self, agent: Agent, network: Network, spec: Spec) -> None:
-        """Put an agent behind a network, in an environment with a spec."""
+    def __init__(self, make_agent: AgentFactory, network: Network, environment: Environment) -> None:
+        """Put the agent that a factory makes for the environment behind a network."""
+        agent, spec = make_agent(environment), environment.spec
         self._agent = agent
         plan: Plan = getattr(agent, "plan", lambda observation: agent.act(observation)[None])
         link = SimulatedLink(plan, network, spec.control_hz)
@@ -237,8 +238,3 @@ class NetworkedAgent:
     def close(self) -> None:
         """Close the agent."""
         close_agent(self._agent)
-
-
-def make_networked(make_agent: AgentFactory, network: Network, environment: Environment) -> NetworkedAgent:
-    """Build an agent at the other end of a network for an environment."""
-    return NetworkedAgent(make_agent(environment), network, environment.spec)

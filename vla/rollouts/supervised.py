@@ -12,10 +12,10 @@ from vla.spec import Agent, Array, Environment, Observation
 class SupervisedAgent:
     """A policy that acts while an expert labels: `info["clean"]` is the expert's action, the label to imitate."""
 
-    def __init__(self, policy: Agent, expert: Agent) -> None:
-        """Let an expert, see `require_memoryless`, label what a policy sees."""
-        require_memoryless(expert)
-        self._policy, self._expert = policy, expert
+    def __init__(self, make_policy: AgentFactory, make_expert: AgentFactory, environment: Environment) -> None:
+        """Let the expert of the environment, see `require_memoryless`, label what the policy sees."""
+        self._policy, self._expert = make_policy(environment), make_expert(environment)
+        require_memoryless(self._expert)
         self.info: dict[str, Any] = {}
 
     def reset(self, instruction: str, seed: int) -> None:
@@ -43,8 +43,3 @@ def require_memoryless(expert: Agent) -> None:
             f"{type(expert).__name__} cannot label the states of another agent: without memoryless = True its actions "
             "may depend on its earlier actions; choose another expert"
         )
-
-
-def make_supervised(make_policy: AgentFactory, make_expert: AgentFactory, environment: Environment) -> SupervisedAgent:
-    """Build the policy and its expert for an environment."""
-    return SupervisedAgent(make_policy(environment), make_expert(environment))
