@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vla.rollouts.realtime import actions_per_plan
 from vla.spec import Array, Observation
 
 if TYPE_CHECKING:
@@ -67,8 +68,3 @@ class Inference:
         # A plan that the next one continues is executed until that one arrives.
         actions = plan if getattr(self._policy, "chunking", None) else plan[: actions_per_plan(self._policy)]
         return actions, time.monotonic() - start
-
-
-def actions_per_plan(policy: Policy) -> int:
-    """Return how many actions of a plan are executed: one with a history, as in training its frames have no gaps."""
-    return 1 if getattr(policy, "history", 1) > 1 else int(policy.execute)

@@ -15,13 +15,14 @@ from std_srvs.srv import SetBool, Trigger
 from vla.deploy.commands import ArmOutput, GripperOutput
 from vla.deploy.control_loop import ControlLoop
 from vla.deploy.diagnostics import Diagnostics
-from vla.deploy.inference import Inference, actions_per_plan
+from vla.deploy.inference import Inference
 from vla.deploy.inputs import Inputs
 from vla.deploy.lifecycle_node import GuardedLifecycleNode, transition
 from vla.deploy.safety import State
 from vla.deploy.settings import PolicySettings
 from vla.io.errors import UserError
 from vla.policy import Policy
+from vla.rollouts.realtime import actions_per_plan
 
 DELIVERY_TIMEOUT = Duration(seconds=1.0)  # longest wait for the last commands to arrive
 

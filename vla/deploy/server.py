@@ -33,11 +33,11 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from vla.deploy.client_observation import Keys, instruction
-from vla.deploy.inference import actions_per_plan
 from vla.io.array_messages import pack, unpack
 from vla.io.errors import UserError, counted
 from vla.io.types import Count, Text
 from vla.parallel.processes import signal_event
+from vla.rollouts.realtime import actions_per_plan
 from vla.spec import Array, Environment, Observation
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -171,19 +171,16 @@ def _fill(
                 in_a_row[episode.task] = []
             else:
                 store.fail(episode)
-                in_a_row[episode.task].append(episode.outcome)
-                _give_up_after(episode.task, in_a_row[episode.task])
+                failures = in_a_row[episode.task]
+                failures.append(episode.outcome)
+                if len(failures) >= MAX_FAILURES:
+                    raise UserError(
+                        f"the expert failed on {len(failures)} seeds of {episode.task} in a row "
+                        f"({dict(Counter(failures))}): watch it with job=preview, or simplify the task"
+                    )
             speed = 60 * (len(store.episodes) - initial_count) / (time.monotonic() - start)
             rate = outcomes[True] / outcomes.total()
             bar.show(len(store.episodes), f"{speed:.0f} episodes/min, success {rate:.0%}")
-
-
-def _give_up_after(task: str, failures: Sequence[str]) -> None:
-    if len(failures) >= MAX_FAILURES:
-        raise UserError(
-            f"the expert failed on {len(failures)} seeds of {task} in a row ({dict(Counter(failures))}): watch it with "
-            "job=preview, or simplify the task"
-        )
 
 
 class DemonstrationWorker:

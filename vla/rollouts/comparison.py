@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import hypot, sqrt
+from math import sqrt
 from operator import attrgetter
 from typing import NamedTuple, TypeVar
 
@@ -113,41 +113,39 @@ def fisher(first_successes: int, first: int, second_successes: int, second: int)
     return float(min(1.0, 2 * distribution.cdf(second_successes), 2 * distribution.sf(second_successes - 1)))
 
 
-def newcombe(first_successes: float, first: float, second_successes: float, second: float) -> tuple[float, float]:
-    """Return the 95 % confidence interval of the second rate minus the first, for independent samples.
+def newcombe(
+    first_successes: float, first: float, second_successes: float, second: float, correlation: float = 0.0
+) -> tuple[float, float]:
+    """Return the 95 % confidence interval of the second rate minus the first; 0 is the correlation of separate samples.
 
     R. G. Newcombe, "Interval estimation for the difference between independent proportions: comparison of eleven
     methods", Statistics in Medicine 17 (1998), 873-890, method 10: it combines Wilson's intervals of both rates.
     """
-    (low_one, high_one), (low_two, high_two) = (
-        wilson_interval(first_successes, first),
-        wilson_interval(second_successes, second),
-    )
+    low_one, high_one = wilson_interval(first_successes, first)
+    low_two, high_two = wilson_interval(second_successes, second)
     one, two = first_successes / first, second_successes / second
-    return two - one - hypot(two - low_two, high_one - one), two - one + hypot(high_two - two, one - low_one)
+
+    def reach(one: float, two: float) -> float:
+        return sqrt(max(one**2 - 2 * correlation * one * two + two**2, 0.0))
+
+    return two - one - reach(two - low_two, high_one - one), two - one + reach(high_two - two, one - low_one)
 
 
 def newcombe_paired(pairs: Pairs) -> tuple[float, float]:
     """Return the 95 % confidence interval of the second rate minus the first, for pairs; (-1, 1) without any.
 
     R. G. Newcombe, "Improved confidence intervals for the difference between binomial proportions based on paired
-    data", Statistics in Medicine 17 (1998), 2635-2650, method 10: it combines Wilson's intervals of both rates with the
-    correlation of the pairs, whose numerator has a continuity correction.
+    data", Statistics in Medicine 17 (1998), 2635-2650, method 10: the numerator of the correlation has a continuity
+    correction.
     """
     size = sum(pairs)
     if size == 0:
         return -1.0, 1.0
     both, first, second, neither = pairs
-    one, two = (both + first) / size, (both + second) / size
-    (low_one, high_one), (low_two, high_two) = wilson_interval(both + first, size), wilson_interval(both + second, size)
     product = (both + first) * (second + neither) * (both + second) * (first + neither)
     numerator = both * neither - first * second
     correlation = (max(numerator - size / 2, 0.0) if numerator > 0 else numerator) / sqrt(product) if product else 0.0
-
-    def reach(one: float, two: float) -> float:
-        return sqrt(max(one**2 - 2 * correlation * one * two + two**2, 0.0))
-
-    return two - one - reach(two - low_two, high_one - one), two - one + reach(high_two - two, one - low_one)
+    return newcombe(both + first, size, both + second, size, correlation)
 
 
 def pairs_of(

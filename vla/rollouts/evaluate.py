@@ -80,24 +80,21 @@ def _play_missing(
     with Bar(name, len(score.seeds), len(score.results), score.note() if score.results else "") as bar:
         seeds = [] if score.advance() else [seed for seed in score.seeds if seed not in score.results]
         groups = [seeds[start : start + size] for start in range(0, len(seeds), size)]
-        group_of, crashed = {pool.submit((group, recorded)): group for group in groups}, False
+        group_of, crashed, decided = {pool.submit((group, recorded)): group for group in groups}, False, False
         for future in pool.as_completed(group_of):
             results = _results(future, group_of[future])
             crashed |= not results
-            if crashed and score.until is not None:  # later results count only after these
-                for pending in group_of:
-                    pending.cancel()
-                break
             for result in results:
                 score.add(result)
                 if result.outcome != ERROR:
                     keep(result)
             bar.show(len(score.results), score.note())
-            if score.advance():
+            decided = score.advance()
+            if decided or (crashed and score.until is not None):  # later results count only after those of a crash
                 for pending in group_of:
                     pending.cancel()
-                return
-    if crashed:  # one by one, to find out which of the episodes in a group it was
+                break
+    if crashed and not decided:  # one by one, to find out which of the episodes in a group it was
         _play_missing(pool, score, recorded, 1, name, keep)
 
 
@@ -117,7 +114,6 @@ class _Score:
         self.outcomes.update(result.outcome for result in self.results.values())
 
     def add(self, result: Result) -> None:
-        """Add a result."""
         self.results[result.seed] = result
         self.outcomes[result.outcome] += 1
 
@@ -224,7 +220,6 @@ class _LenientRecorder:
         self.start, self.step = recorder.start, recorder.step
 
     def end(self, episode: Episode) -> None:
-        """Write the recording, or log a warning."""
         try:
             self._recorder.end(episode)
         except OSError as error:
@@ -253,7 +248,6 @@ class _RolloutWorker:
         return play_episodes(self._environments, self._agent, seeds, self._recorders if recorded else None)
 
     def close(self) -> None:
-        """Close the environments and the agent."""
         for environment in self._environments:
             environment.close()
         close_agent(self._agent)

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -205,6 +206,11 @@ class BackgroundLink:
         self._thread.shutdown()
 
 
+def actions_per_plan(agent: Any) -> int:
+    """Return how many actions of a plan are executed: one with a history, as in training its frames have no gaps."""
+    return 1 if getattr(agent, "history", 1) > 1 else getattr(agent, "execute", None) or 1
+
+
 class NetworkedAgent:
     """An agent at the other end of a simulated network; one that does not plan chunks has chunks of one action."""
 
@@ -214,17 +220,13 @@ class NetworkedAgent:
         self._agent = agent
         plan: Plan = getattr(agent, "plan", lambda observation: agent.act(observation)[None])
         link = SimulatedLink(plan, network, spec.control_hz)
-        self._real_time = RealTime(spec, link, self._execute, network.ensemble)
+        self._real_time = RealTime(spec, link, partial(actions_per_plan, agent), network.ensemble)
         self.info: dict[str, Any] = {}
 
     def reset(self, instruction: str, seed: int) -> None:
         """Start an episode."""
         self._real_time.reset(seed)
         self._agent.reset(instruction, seed)
-
-    def _execute(self) -> int:
-        """Return how many actions to execute before the next observation is sent; a history needs every observation."""
-        return 1 if getattr(self._agent, "history", 1) > 1 else getattr(self._agent, "execute", None) or 1
 
     @property
     def looks(self) -> bool:

@@ -188,15 +188,12 @@ class _DistantPolicy:
         self._memory = SharedMemory(name)
 
     def reset(self, instruction: str, seed: int) -> None:
-        """Start an episode."""
         self._ask("reset", instruction, seed)
 
     def act(self, observation: Observation) -> Array:
-        """Return the action to execute, (D,) float32."""
         return self._show("act", observation)
 
     def plan(self, observation: Observation) -> Array:
-        """Return a chunk of actions, (k, D) float32."""
         return self._show("plan", observation)
 
     def _show(self, kind: str, observation: Observation) -> Array:
@@ -220,6 +217,5 @@ class _DistantPolicy:
         return result
 
     def close(self) -> None:
-        """Disconnect from the policy."""
         self._memory.close()
         self._connection.close()

@@ -89,20 +89,16 @@ class _SingleLane:
         self.agent = agent
 
     def reset(self, instruction: str, seed: int, lane: int) -> None:
-        """Start an episode."""
         self.agent.reset(instruction, seed)
 
     def act(self, observations: Sequence[Observation], lanes: Sequence[int], /) -> Array:
-        """Return the action to execute, (1, D)."""
         (observation,) = observations
         return np.array(self.agent.act(observation), dtype=np.float32)[None]
 
     def about(self, lane: int) -> dict[str, Any]:
-        """Return what is known about the last action."""
         return self.agent.info
 
     def looking(self, lane: int) -> bool:
-        """Return whether the next action may depend on the images."""
         return getattr(self.agent, "looks", True)
 
 
