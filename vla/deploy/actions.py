@@ -44,12 +44,10 @@ class GoalSender:
         complaint: Callable[[Any, bool], str],
         on_end: Callable[[], None] = lambda: None,
     ) -> None:
-        """Args:
-        node: sends the goals, and fails with one sentence when the server refuses, gives up or vanishes.
-        kind: class of the action.
-        name: of the server.
-        complaint: describes what went wrong from a result and whether another goal has replaced its goal; may be empty.
-        on_end: called when the newest goal has ended.
+        """Send goals of an action class from a node, which fails when the server refuses, gives up or vanishes.
+
+        A `complaint` describes what went wrong from a result and whether another goal has replaced its goal; it may be
+        empty. `on_end` is called when the newest goal has ended.
         """
         self.name = node.resolve_topic_name(name)
         self._node, self.kind, self._complaint, self._ended = node, kind, complaint, on_end

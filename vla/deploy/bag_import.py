@@ -68,7 +68,6 @@ class _Segment(NamedTuple):
     end: float
 
     def __str__(self) -> str:
-        """Format the time and the instruction."""
         return f"{self.start:.1f} to {self.end:.1f} s, '{messages.shorten(self.instruction)}'"
 
 
@@ -349,7 +348,6 @@ def _covers(track: Track, time: float) -> bool:
 
 
 def _interpolate(track: Track, time: float) -> Array:
-    """Interpolate linearly."""
     index = min(bisect_left(track, time, key=ARRIVAL), len(track) - 1)
     (begin, start), (end, stop) = track[max(index - 1, 0)], track[index]
     return start + min(max((time - begin) / max(end - begin, 1e-9), 0.0), 1.0) * (stop - start)

@@ -16,7 +16,7 @@ from annotated_types import MaxLen
 
 from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.observer import JointMeasurement
-from vla.io.documents import STRICT, parse_json
+from vla.io.documents import STRICT
 from vla.io.errors import UserError
 from vla.io.images import decode_image
 from vla.io.printable import escape
@@ -32,7 +32,6 @@ ENCODINGS = {
 }
 
 HANDED_OVER = "handed over"  # in the agent's status: yes if a person moves the arm, and in a dry run; else no
-MAX_EPISODE_CHARACTERS = 100_000  # characters of a message about an episode
 FINGERS_AGE = 0.5  # oldest state of fingers that come in messages of their own [s]
 LIMIT_TOLERANCE = 0.5  # distance outside its limits at which an arm moved by a person may still be [rad]
 
@@ -51,11 +50,6 @@ class SimulatedEpisode:
     outcome: Name
     task: Annotated[str, MaxLen(100)]
     milestones: Annotated[tuple[Name, ...], MaxLen(100)]
-
-    @classmethod
-    def from_message(cls, message: Any) -> SimulatedEpisode:
-        """Read a std_msgs/String; raise a UserError if it is no episode."""
-        return parse_json(message.data[:MAX_EPISODE_CHARACTERS], cls, "/vla_simulator/episode")
 
 
 def shorten(text: str, max_length: int = 80) -> str:

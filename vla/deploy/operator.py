@@ -21,6 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from vla.deploy.lifecycle_node import LATCHED_QOS
 from vla.deploy.messages import SimulatedEpisode
+from vla.io.documents import parse_json
 from vla.io.errors import UserError
 from vla.rollouts.motion import Motion
 from vla.rollouts.results import Result
@@ -30,6 +31,7 @@ log = logging.getLogger(__name__)
 TIMEOUT = 10.0  # of the discovery of a subscriber or service, of a service call, and of a status [s]
 SETTLING_TIME = 0.7  # discovery is complete after so long without a new subscriber [s]
 START = 600.0  # longest start of both nodes of the demo, with a large policy that is compiled or exported [s]
+MAX_EPISODE_CHARACTERS = 100_000  # of a message about an episode
 AGENT, SIMULATOR = "/vla_agent", "/vla_simulator"
 
 
@@ -175,7 +177,8 @@ class DemoOperator(Operator):
 
     def _on_episode(self, message: Any) -> None:
         try:
-            self._episode = SimulatedEpisode.from_message(message)
+            text = message.data[:MAX_EPISODE_CHARACTERS]
+            self._episode = parse_json(text, SimulatedEpisode, f"{SIMULATOR}/episode")
         except UserError as error:  # anybody on the network can send one
             log.warning("dropped a message: %s", error)
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from math import ceil, log, sqrt
 
 import numpy as np
+from scipy.special import betaln
+from scipy.stats import binom
 
 from vla.rollouts.sequential import LEVEL
 from vla.rollouts.statistics import NORMAL_QUANTILE
@@ -33,8 +35,6 @@ def episodes_needed(power: Callable[[int], float], target: float) -> int | None:
 
 def power_for_bar(episodes: int, rate: float, bar: float) -> float:
     """Return the probability that Wilson's interval of a success rate excludes a bar, on the side of the true rate."""
-    from scipy.stats import binom  # the import takes a second
-
     successes = np.arange(episodes + 1)
     distances = (successes / episodes - bar) * (1 if rate > bar else -1)
     decisive = distances > NORMAL_QUANTILE * sqrt(bar * (1 - bar) / episodes)  # then Wilson's interval excludes the bar
@@ -46,8 +46,6 @@ def power_of_pairs(episodes: int, discordant: float, difference: float) -> float
 
     In the share `discordant` of them only one succeeds.
     """
-    from scipy.stats import binom
-
     mean, spread = episodes * discordant, MAX_DEVIATION * sqrt(episodes * discordant) + MAX_DEVIATION
     counts = np.arange(max(0, int(mean - spread)), min(episodes, int(mean + spread)) + 1)
     limits = binom.ppf(LEVEL / 2, counts, 0.5)
@@ -58,8 +56,6 @@ def power_of_pairs(episodes: int, discordant: float, difference: float) -> float
 
 def power_of_samples(episodes: int, one: float, other: float) -> float:
     """Return the probability that Fisher's exact test finds the difference of two rates, each of so many episodes."""
-    from scipy.stats import binom
-
     one, other = sorted((one, other))
     counts = np.arange(episodes + 1)
     ways = binom.logpmf(counts, episodes, 0.5)  # and a constant, which cancels
@@ -92,8 +88,6 @@ def stopping(mean: float, one: float, zero: float, target: float, fixed: int) ->
     `zero`. The share `target` of the evaluations is to be decided, which takes `fixed` episodes without early stopping.
     Returns None if a smaller share is decided after `HORIZON` times as many.
     """
-    from scipy.stats import binom
-
     rate = one + zero  # observations per episode
     counts = np.arange(1, ceil(HORIZON * fixed * rate) + 11)  # of observations
     bounds = _largest_decisive(mean, counts), counts - _largest_decisive(1 - mean, counts)
@@ -116,8 +110,6 @@ def _largest_decisive(mean: float, counts: Array) -> Array:
 
     The capital is that of `vla.rollouts.sequential.log_capital` in its closed form.
     """
-    from scipy.special import betaln
-
     low, high = np.full_like(counts, -1), np.floor(mean * counts).astype(counts.dtype)
     while (high - low > 1).any():
         middle = np.maximum((low + high) // 2, 0)

@@ -29,6 +29,7 @@ from vla.parallel.processes import make_picklable, one_thread_each
 from vla.spec import Agents, Array, Environment, Observation, RunningPlan, Spec
 
 MAX_WORKERS = 1024  # workers
+STATE = "a state"  # beside the cameras in shared memory, as an error calls it
 LONG_FOLDER = 60  # bytes of a path: that of a socket has at most 103, and folders of batch jobs are longer
 
 
@@ -130,7 +131,7 @@ def _talk(
     policy: _Planner, requests: queue.Queue[Request | None], lane: int, connection: Connection, spec: Spec
 ) -> None:
     """Pass the requests of a worker, whose world has this spec, on to the policy until it leaves."""
-    memory = SharedMemory(create=True, size=sum(_sizes(spec)))
+    memory = SharedMemory(create=True, size=_layout(spec).itemsize)
     try:
         with connection, suppress(EOFError, OSError):  # it has left, or was killed
             connection.send((memory.name, policy.spec, policy.execute, policy.history))
@@ -150,24 +151,15 @@ def _observation(
     memory: SharedMemory, spec: Spec, instruction: str, has_images: bool, running: RunningPlan | None
 ) -> Observation:
     """Return the observation of a worker: a copy of the arrays in its shared memory, and the parts that it sent."""
-    images = {name: view.copy() for name, view in _views(memory, spec).items()}
-    state = images.pop("")
-    return Observation(images if has_images else {}, state, instruction, running=running)
+    arrays = np.ndarray((), _layout(spec), memory.buf).copy()
+    images = {camera: arrays[camera] for camera in spec.cameras if has_images}
+    return Observation(images, arrays[STATE], instruction, running=running)
 
 
-def _sizes(spec: Spec) -> list[int]:
-    """Return the bytes of every image, and of the state."""
-    return [*[3 * int(np.prod(spec.image_size))] * len(spec.cameras), 4 * len(spec.state)]
-
-
-def _views(memory: SharedMemory, spec: Spec) -> dict[str, Array]:
-    """Return camera → its image (H, W, 3) in shared memory, and "" → the state (P,)."""
-    starts = np.cumsum([0, *_sizes(spec)])
-    views: dict[str, Array] = {
-        camera: np.ndarray((*spec.image_size, 3), np.uint8, memory.buf, int(start))
-        for camera, start in zip(spec.cameras, starts, strict=False)
-    }
-    return views | {"": np.ndarray(len(spec.state), np.float32, memory.buf, int(starts[len(spec.cameras)]))}
+def _layout(spec: Spec) -> np.dtype:
+    """Return the layout of an observation in shared memory: camera → its image (H, W, 3), and `STATE` → (P,)."""
+    images = [(camera, np.uint8, (*spec.image_size, 3)) for camera in spec.cameras]
+    return np.dtype([*images, (STATE, np.float32, (len(spec.state),))])
 
 
 class _DistantPolicy:
@@ -198,12 +190,14 @@ class _DistantPolicy:
 
     def _show(self, kind: str, observation: Observation) -> Array:
         """Write an observation to the shared memory, and return the answer of the policy."""
-        arrays: Mapping[str, Array] = {**observation.rgb, "": np.asarray(observation.state, np.float32)}
-        for name, view in _views(self._memory, self._world).items():
-            array = arrays.get(name, view)
+        arrays: Mapping[str, Array] = {**observation.rgb, STATE: np.asarray(observation.state, np.float32)}
+        layout = _layout(self._world)
+        memory = np.ndarray((), layout, self._memory.buf)
+        for name in layout.names or ():
+            view, array = memory[name], arrays.get(name, memory[name])
             if (array.shape, array.dtype) != (view.shape, view.dtype):
                 expected, actual = (f"{side.shape} {side.dtype}" for side in (view, array))
-                raise UserError(f"the world gives {name or 'a state'} of {actual}, but its spec says {expected}")
+                raise UserError(f"the world gives {name} of {actual}, but its spec says {expected}")
             view[:] = array
         has_images = all(camera in arrays for camera in self._world.cameras)
         return self._ask(kind, observation.instruction, (has_images, observation.running))
