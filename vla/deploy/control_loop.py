@@ -11,7 +11,7 @@ import numpy as np
 
 from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.motion import Command, Goals, Motion
-from vla.deploy.observer import JointMeasurement, Observer
+from vla.deploy.observer import Observer
 from vla.deploy.safety import Safety, State, Tracking
 from vla.io.errors import UserError
 from vla.schedule import Delays
@@ -132,7 +132,7 @@ class ControlLoop:
             raise UserError(problem)
         if self.observer.displacement(REST_TIME) > REST_MOTION:
             raise UserError("the arm still moves: let it rest first")
-        self.motion.start(joint_state.joints, None, now)
+        self.motion.start(joint_state.joints, now)
         self._tracking = Tracking(self.safety, self._follows_positions)
         self.handed_over, self._instructed_at = False, now
         if self.state is State.HANDED_OVER:
@@ -234,7 +234,10 @@ class ControlLoop:
             # The arm may be elsewhere by now, or one of two sources of joint states may not have been heard yet.
             if problem := self._joints_problem(now) or self._history_problem():
                 return None if self.state is State.STOPPED else self._set_state(self.state, problem)
-            self._take_over(joint_state, now)
+            try:
+                self.motion.start(joint_state.joints, now)
+            except UserError as error:
+                self.fail(str(error))
         off_track, moved_unseen = self._tracking.check(self.motion, joint_state, now)
         if moved_unseen or (off_track and self._must_stay):
             # The earlier commanded pose is dropped, because the arm would rush back to it.
@@ -256,13 +259,6 @@ class ControlLoop:
             self._set_state(State.HOLDING if self.state is State.RUNNING else self.state, problem)
         elif self.state is State.WAITING or self.observer.fresh_sets >= self.safety.fresh_frames:
             self._set_state(State.RUNNING, "")
-
-    def _take_over(self, state: JointMeasurement, now: float) -> None:
-        """Make the measured pose the first commanded one."""
-        try:
-            self.motion.start(state.joints, None, now)  # a grip would loosen at its measured opening
-        except UserError as error:
-            self.fail(str(error))
 
     @property
     def _must_stay(self) -> bool:

@@ -37,9 +37,7 @@ class Inference:
         """Run three inferences on noise: the first ones are slow."""
         noise = self._policy.spec.random_observation(np.random.default_rng(0))
         for _ in range(3):
-            self._pool.submit(self._plan, noise, True).result()
-        self._policy.reset("", 0)
-        self._episodes = count()
+            self._pool.submit(self._policy.plan, noise).result()
 
     def start(self, observation: Observation, is_first: bool) -> None:
         """Start an inference; `is_first` begins an episode."""

@@ -113,7 +113,7 @@ class Motion:
         self.limiter, self.tick = JointLimiter(limits, tick), tick
         self._workspace, self._period = workspace, period
         self.schedule = Schedule[Waypoint](period)
-        self._opening: float | None = 1.0
+        self._opening: float | None = None
         self._commanded: deque[tuple[float, Array]] = deque()  # at, joints
         # Trajectory that an arm executes by itself: since when, the state before it and its commands, and whether it is
         # still to be followed.
@@ -125,10 +125,11 @@ class Motion:
         """Whether there is a commanded pose."""
         return bool(self._commanded)
 
-    def start(self, measured: Array, opening: float | None, now: float) -> None:
+    def start(self, measured: Array, now: float) -> None:
         """Take an arm over at its measured joints (J,), at rest; raise a UserError if it is outside its limits."""
         self.limiter.start(measured)
-        self._opening, self._sent_trajectory, self._sent_valid = opening, None, False
+        self._opening = None  # a grip would loosen at its measured opening
+        self._sent_trajectory, self._sent_valid = None, False
         self._commanded.clear()
         self._record(now)
 
