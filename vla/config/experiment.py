@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from vla.models.model import Model
     from vla.models.policy_folder import SavedPolicy
     from vla.models.tokenizers.tokenizer import ActionTokenizer
-    from vla.parallel.pool import Cluster
     from vla.policy import Policy
     from vla.spec import Agent, Environment, Recorder
 
@@ -169,10 +168,6 @@ class Experiment:
         """Return the factory of the recorder that writes into a folder, or None without a recorder."""
         node = self.nodes["recorder"]
         return partial(build, node, "recorder", folder=folder) if node else None
-
-    def cluster(self) -> Cluster:
-        """Build the cluster."""
-        return self.build("cluster")
 
     @property
     def checkpoint(self) -> Path | None:

@@ -74,7 +74,7 @@ def _source(experiment: Experiment) -> tuple[Environment | SpecOnly, Spec, Impor
 
 
 def _fill(experiment: Experiment) -> EpisodeStore:
-    collection, cluster = experiment.collect, experiment.cluster()
+    collection, cluster = experiment.collect, experiment.build("cluster")
     world, spec, recordings = _source(experiment)
     if recordings is not None:
         recordings.require_enough(collection.episodes)

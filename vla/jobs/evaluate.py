@@ -196,7 +196,9 @@ def _play(
     world = experiment.world() if options.until else None
     turns = len(world.tasks) if isinstance(world, Multitask) else 1
     lanes = 1 if _is_shared(experiment) else (experiment["policy"] or {}).get("lanes", 1)  # shared: workers are lanes
-    play = partial(evaluate, cluster=experiment.cluster(), turns=turns, lanes=lanes, recordings=options.recordings)
+    play = partial(
+        evaluate, cluster=experiment.build("cluster"), turns=turns, lanes=lanes, recordings=options.recordings
+    )
     conditions, reports, seeds = _conditions(experiment, make_agent), dict[str, Report](), list(options.seeds)
     until = (lambda report: all(statement.is_decided(report) for statement in statements)) if statements else None
     for number, (name, (make_environment, make_its_agent)) in enumerate(conditions.items(), 1):

@@ -19,4 +19,4 @@ def run(experiment: Experiment) -> None:
     if getattr(exporter, "of_policies", False):
         log.info("wrote %s", exporter.export(experiment.make_policy()()))
     else:
-        log.info("wrote %s", exporter.export(demonstrations(experiment), experiment.cluster()))
+        log.info("wrote %s", exporter.export(demonstrations(experiment), experiment.build("cluster")))

@@ -96,14 +96,14 @@ def _require_possible(experiment: Experiment) -> range:
         raise UserError(f"{experiment.settings.output} has a training without rounds: choose another output=DIR")
     if devices(experiment["trainer"]) > 1:
         raise UserError("job=improve trains on one device, as its trainings follow each other: add trainer.devices=1")
-    if experiment.pretrained is not None:
-        _require_further_episodes(experiment, experiment.pretrained)
+    if (policy := experiment.pretrained) is not None:
+        _require_further_episodes(experiment, policy)
     with closing(experiment.make_environment()()) as environment:
         expert = experiment.make_expert()(environment)
         close_agent(expert)
         require_memoryless(expert)
         require_trainable(environment.spec, map(EpisodeStore, experiment.collect.more or ()))
-        if (policy := experiment.pretrained) is not None:
+        if policy is not None:
             read_policy(policy).spec.require_input(environment.spec, f"the checkpoint {policy}", "the task")
         with closing(experiment.make_environment(options.changes)()) as variant:
             environment.spec.require(variant.spec, "the task", "the task with improve.changes")
@@ -136,20 +136,17 @@ def require_new(seeds: range, store: EpisodeStore) -> None:
 def _labelled_store(experiment: Experiment, checkpoint: Path, folder: Path, seed: int) -> EpisodeStore:
     """Return the store of a round: episodes of the policy in a checkpoint, labelled by the expert; add missing ones."""
     options = experiment.options(Rounds)
-    task = with_changes(experiment["task"], options.changes)
-    environment = experiment.make_environment(options.changes)
+    variant = experiment.with_values({"task": with_changes(experiment["task"], options.changes)})
     nodes = {
-        "task": task,
-        "expert": experiment["expert"],
+        **variant.source,
         "policy": {**experiment["policy"], "weights": read_policy(checkpoint).training.weights[:12]},
         "improve": {"episodes": options.episodes, "seed": seed},
     }
-    world = environment()
-    world.close()
-    store = EpisodeStore.create_or_open(folder, world.spec, nodes, experiment.collect.codec)
+    store = EpisodeStore.create_or_open(folder, variant.world().spec, nodes, experiment.collect.codec)
     with agents_for_workers(experiment, checkpoint) as make_policy:
         agent = partial(SupervisedAgent, make_policy, experiment.make_expert())
-        collect(store, environment, agent, options.episodes, experiment.cluster(), seed, keep_failures=True)
+        cluster = experiment.build("cluster")
+        collect(store, variant.make_environment(), agent, options.episodes, cluster, seed, keep_failures=True)
     return EpisodeStore(folder)
 
 
