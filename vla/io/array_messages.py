@@ -23,11 +23,7 @@ DTYPES = {np.dtype(name).str: np.dtype(name) for name in ("bool", *"bBhHiIlLqQ",
 
 
 def pack(message: Any) -> bytes:
-    """Encode plain values and arrays.
-
-    Raises:
-        TypeError: a value is neither.
-    """
+    """Encode plain values and arrays; raise a TypeError for anything else."""
     data: Any = msgpack.packb(message, default=_encode)
     return bytes(data)
 
@@ -35,8 +31,7 @@ def pack(message: Any) -> bytes:
 def unpack(data: bytes) -> Any:
     """Decode a message; arrays are read-only views of `data`, and those without a dimension are Python's numbers.
 
-    Raises:
-        UserError: it is damaged, too large, or holds something else than plain values and arrays of numbers.
+    Raises a UserError if it is damaged, too large, or holds something else than plain values and arrays of numbers.
     """
     budget = _Budget()
     bounds = {"max_array_len": LONGEST_LIST, "max_map_len": LARGEST_MAP, "max_str_len": LONGEST_TEXT, "max_ext_len": 0}

@@ -36,9 +36,8 @@ SHA256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 def read_json(path: Path, kind: type[T], max_bytes: int = MAX_BYTES) -> T:
     """Read the JSON file at `path` as a `kind`: a dataclass, a typed dictionary or any annotation.
 
-    Raises:
-        UserError: the file is larger than `max_bytes` [bytes], nested too deep, not JSON, or not of that kind.
-        OSError: it cannot be read.
+    Raises an OSError if it cannot be read, and a UserError if it is larger than `max_bytes`, nested too deep, not JSON,
+    or not of that kind.
     """
     return parse_json(read_bounded(path, max_bytes), kind, str(path))
 
@@ -59,7 +58,7 @@ def parse_json(text: str | bytes, kind: type[T], name: str) -> T:
     try:
         value: T = _adapter(cast(Any, kind)).validate_json(text, strict=True)
     except ValidationError as error:
-        raise UserError(f"{name} is damaged or of another kind: {problems(error)}") from error
+        raise UserError(f"{name} is damaged or of another kind: {_problems(error)}") from error
     return value
 
 
@@ -90,9 +89,8 @@ def _require_shallow(text: bytes) -> None:
 def resolve_config(value: Any, name: str) -> Any:
     """Return a copy of a configuration from a file, called `name`: dicts with texts as keys, lists, and plain values.
 
-    Raises:
-        UserError: a value is no mapping, list, text, finite number or null; a key is no text; a text contains `${`,
-            which would be resolved later; or there are more than `MAX_VALUES` values or `MAX_DEPTH` levels.
+    Raises a UserError if a value is no mapping, list, text, finite number or null; a key is no text; a text contains
+    `${`, which would be resolved later; or there are more than `MAX_VALUES` values or `MAX_DEPTH` levels.
     """
     # Exact types, because a checkpoint's pickle can make a mapping whose methods hide what it holds.
     count = itertools.count(1)
@@ -154,16 +152,14 @@ def canonicalize(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def problems(error: ValidationError) -> str:
+def _problems(error: ValidationError) -> str:
     """Format the first three validation errors, as `spec.cameras[0]: Input should be a valid string`."""
-    messages = [f"{_prefix(item['loc'])}{item['msg']}" for item in error.errors(include_url=False, include_input=False)]
-    suffix = f"; and {len(messages) - 3} more" if len(messages) > 3 else ""
-    return "; ".join(messages[:3]) + suffix
-
-
-def _prefix(location: tuple[int | str, ...]) -> str:
-    path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
-    return f"{path.lstrip('.')[:100]}: " if path else ""
+    messages = []
+    for item in error.errors(include_url=False, include_input=False):
+        path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in item["loc"])
+        messages.append(f"{path.lstrip('.')[:100]}: {item['msg']}" if path else item["msg"])
+    rest = [f"and {len(messages) - 3} more"] if len(messages) > 3 else []
+    return "; ".join([*messages[:3], *rest])
 
 
 def read_bounded(path: Path, max_bytes: int = MAX_BYTES) -> bytes:

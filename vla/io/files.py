@@ -29,11 +29,8 @@ def atomic_path(target: Path) -> Iterator[Path]:
     """Yield a draft path beside `target`, for a file or a folder; the draft replaces `target` at the end.
 
     A folder is replaced in two steps: a process that is killed between them leaves none under that name.
-
-    Several processes may write to one target at once. On failure the draft is removed and `target` stays as it was.
-
-    Raises:
-        OSError: the draft cannot be written; the message names `target`.
+    Several processes may write to one target at once. On failure the draft is removed and `target` stays as it was;
+    an OSError of a draft that cannot be written names `target`.
     """
     # Not the id of this process: in containers, a killed process or one of another machine may have had the same.
     # The suffix is kept, because libraries choose the format by it.
@@ -80,11 +77,7 @@ def write_json(target: Path, content: object) -> None:
 
 
 def require_file(path: Path) -> None:
-    """Require that `path` is missing or a regular file, because reading from a pipe or a device may never end.
-
-    Raises:
-        UserError: it is a folder, a pipe or a device.
-    """
+    """Raise a UserError if `path` is a folder, or a pipe or device, from which reading may never end."""
     if path.exists() and not path.is_file():
         raise UserError(f"{path} is a folder, a pipe or a device, not a file")
 

@@ -73,10 +73,9 @@ class Part:
 
 
 def cut(picture: Array, window: Sequence[float] | Array, size: tuple[int, int]) -> Array:
-    """Return a window of a picture (H, W, 3) uint8, averaged over areas to a size: height and width [px].
+    """Return a window of a picture, averaged over areas to a size (height, width) [px].
 
-    Raises:
-        UserError: the picture has another shape or type.
+    Raises a UserError if the picture is not (H, W, 3) uint8.
     """
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
         raise UserError(f'the image "{PICTURE}" must be (H, W, 3) uint8, and is {picture.dtype} of {picture.shape}')
@@ -91,18 +90,11 @@ def with_parts(
 ) -> Mapping[str, Array]:
     """Add the images, (*size, 3), of the parts that `images` lacks, cut out of the whole picture.
 
-    Args:
-        images: camera → (H, W, 3) uint8, and `PICTURE`.
-        state: component → its value.
-        parts: the parts of the picture.
-        size: height and width [px] of what is cut out.
+    `images` are camera → (H, W, 3) uint8, with `PICTURE`; `state` is component → value; `size` is height, width [px].
     """
-    missing = [part for part in parts if part.camera not in images]
-    places = [np.array([state[name] for name in part.point], np.float64) for part in missing]
-    return {
-        **images,
-        **{
-            part.camera: cut(images[PICTURE], part.window_at(place), size)
-            for part, place in zip(missing, places, strict=True)
-        },
-    }
+    all_images = dict(images)
+    for part in parts:
+        if part.camera not in images:
+            place = np.array([state[name] for name in part.point], np.float64)
+            all_images[part.camera] = cut(images[PICTURE], part.window_at(place), size)
+    return all_images

@@ -1,7 +1,4 @@
-"""Constrained types for constructor arguments and records in files, validated by `vla.config.annotations`.
-
-Validation also requires every float to be finite.
-"""
+"""Constrained types for constructor arguments and records in files; validation also requires floats to be finite."""
 
 from __future__ import annotations
 
