@@ -17,10 +17,7 @@ MEMORY_FILES = (
 
 
 def cores() -> int:
-    """Return the number of cores that processes may use: the CPU affinity, or the container's quota if it is smaller.
-
-    `LOKY_MAX_CPU_COUNT` limits it further.
-    """
+    """Return the number of cores that processes may use by CPU affinity, container's quota and `LOKY_MAX_CPU_COUNT`."""
     from loky import cpu_count  # takes a twentieth of a second
 
     return int(cpu_count())
@@ -35,10 +32,7 @@ def processor() -> str:
 
 
 def free_memory() -> int:
-    """Return the free memory [bytes] of the machine, or of the control group that has the least.
-
-    Containers and batch systems limit memory by control groups.
-    """
+    """Return the free memory [bytes] of the machine, or of the control group (of a container or job) with the least."""
     return min(free for _, free in _limits())
 
 
@@ -53,21 +47,18 @@ def memory() -> int:
 
 
 def _limits() -> Iterator[tuple[int, int]]:
-    """Yield the whole memory and the free part of it [bytes], of the machine and of each limited control group."""
+    """Yield the whole memory and the free part of it [bytes], of the machine and of each limited control group of this
+    process, their parents included."""
     machine = psutil.virtual_memory()
     yield machine.total, machine.available
-    for group in _groups():
-        yield from _group_limit(group)
-
-
-def _groups() -> Iterator[Path]:
-    """Yield the folders of the control groups of this process, their parents included."""
     lines = MEMBERSHIP.read_text().splitlines() if MEMBERSHIP.exists() else []
     for _, controllers, path in (line.split(":", 2) for line in lines):
         if controllers in ("", "memory"):
             root = CGROUPS / controllers
             group = root / path.lstrip("/")
-            yield from (folder for folder in (group, *group.parents) if folder.is_relative_to(root))
+            for folder in (group, *group.parents):
+                if folder.is_relative_to(root):
+                    yield from _group_limit(folder)
 
 
 def _number(file: Path) -> int | None:

@@ -19,14 +19,7 @@ from typing import Any, Literal
 from vla.io.errors import UserError
 from vla.io.types import Count
 from vla.parallel.limits import cores
-from vla.parallel.processes import (
-    ProcessEnded,
-    Worker,
-    WorkerFactory,
-    WorkerProcess,
-    allow_many_files,
-    one_thread_each,
-)
+from vla.parallel.processes import ProcessEnded, Worker, WorkerFactory, WorkerProcess, allow_many_files, one_thread_each
 
 log = logging.getLogger(__name__)
 
