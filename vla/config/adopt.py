@@ -95,11 +95,7 @@ def finetune(cfg: DictConfig, overrides: Sequence[str]) -> DictConfig:
 
 
 def _with_trunk(cfg: DictConfig) -> DictConfig:
-    """Return `cfg` with the published policy or vision-language model `cfg.pretrained` as its `model.trunk`.
-
-    Raises:
-        UserError: the chosen model has no trunk.
-    """
+    """Return `cfg` with published weights, `cfg.pretrained`, as `model.trunk`; a UserError if the model has none."""
     if "trunk" not in cfg.model:
         raise UserError(
             f"pretrained={cfg.pretrained} has weights of another project: choose their model, as in model=smolvla"

@@ -12,7 +12,7 @@ from vla.config.annotations import MissingLibrary, fits, locate
 from vla.config.build import GROUPS, Group, arguments, check_node, product_type, require_known
 from vla.config.differences import ABSENT, value_at
 from vla.config.experiment import Experiment
-from vla.config.nodes import Evaluation, Rounds, Settings, Validation, with_changes
+from vla.config.nodes import Rounds, Settings, with_changes
 from vla.config.packages import config_folders
 from vla.io.documents import read_yaml
 from vla.io.errors import UserError
@@ -130,8 +130,13 @@ def _check_group(node: Any, group: Group, may_lack: bool) -> None:
 def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None:
     """Check that values are compatible, and the task under every condition and with all other changes."""
     settings, validate, evaluate = experiment.settings, experiment.validate, experiment.evaluate
-    if settings.checkpoint is None:  # with a checkpoint, the seeds of its own training count
-        _require_apart(validate, evaluate)
+    one, other = validate.seeds, evaluate.seeds
+    # With a checkpoint, the seeds of its own training count.
+    if settings.checkpoint is None and range(max(one.start, other.start), min(one.stop, other.stop)):
+        raise UserError(
+            f"validate.seed={one.start} and evaluate.seed={other.start} share episodes, but episodes that select the "
+            "weights must not evaluate them: change one of the two"
+        )
     conditions = {}
     if settings.job in ("evaluate", "improve"):
         conditions = {f"evaluate.conditions.{name}": changes for name, changes in evaluate.changes.items()}
@@ -158,15 +163,6 @@ def devices(trainer: Mapping[str, Any]) -> int:
     from torch.cuda import device_count  # slow to import
 
     return max(device_count(), 1) * nodes
-
-
-def _require_apart(validate: Validation, evaluate: Evaluation) -> None:
-    one, other = validate.seeds, evaluate.seeds
-    if range(max(one.start, other.start), min(one.stop, other.stop)):
-        raise UserError(
-            f"validate.seed={one.start} and evaluate.seed={other.start} share episodes, but episodes that select the "
-            "weights must not evaluate them: change one of the two"
-        )
 
 
 def _require_together(tokenizer: type, model: type) -> None:

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 Node = dict[str, Any]
 T = TypeVar("T")
-PARTS = ("tokenizer", "model")  # of a policy
 
 
 @dataclass(frozen=True)
@@ -180,28 +179,23 @@ class Experiment:
         return _policy_folder(self.settings.pretrained)
 
     def learner(self, spec: Spec, origin: Path | None = None, last_checkpoint: Path | None = None) -> Learner:
-        """Build the learner with initial weights; without any, the caller must then call `fit_tokenizer`.
+        """Build the learner for demonstrations of a spec; without initial weights, the caller then fits the tokenizer.
 
-        Raises a UserError if the policy or checkpoint is damaged, or the policy has another spec.
-
-        Args:
-            spec: of the demonstrations.
-            origin: folder of the policy that has the weights.
-            last_checkpoint: Lightning's checkpoint of this training, which is to continue.
+        The weights are those of the policy in the folder `origin`, or of Lightning's `last_checkpoint` of the training.
+        Raises a UserError if either is damaged, or the policy has another spec.
         """
         from vla.models.checkpoint import read_content, weights_of
         from vla.models.policy_folder import read_policy
         from vla.models.trunk import Source
 
-        saved, content = (
-            read_policy(origin) if origin else None,
-            read_content(last_checkpoint) if last_checkpoint else None,
-        )
+        saved = read_policy(origin) if origin else None
+        content = read_content(last_checkpoint) if last_checkpoint else None
+        initial_spec = spec
         if saved:
             saved.spec.require_input(spec, f"the policy {origin}", "the demonstrations")
-        initial_spec = (
-            saved.spec if saved else Spec.from_dict(content["spec"], str(last_checkpoint)) if content else spec
-        )
+            initial_spec = saved.spec
+        elif content:
+            initial_spec = Spec.from_dict(content["spec"], str(last_checkpoint))
         spec = replace(spec, robot=initial_spec.robot, image_size=initial_spec.image_size)
         model = _model(self.nodes, spec, saved, weights=bool(origin or last_checkpoint))
         if saved:
@@ -251,19 +245,14 @@ def _changes(cfg: DictConfig, nodes: Node, make_default: Callable[[], DictConfig
     for key, raw, default_raw in differences(unresolved, default_unresolved):
         if key.rpartition(".")[2] == SECRET or key.startswith("chosen."):  # the values of options are compared
             continue
-        if raw == ABSENT and _class_differs(key, nodes, default_nodes):  # a setting of the default's class
+        target = f"{key.rpartition('.')[0]}._target_"
+        if raw == ABSENT and value_at(nodes, target) != value_at(default_nodes, target):  # of the default's class
             continue
         value, standard = value_at(nodes, key), value_at(default_nodes, key)
         if value != standard or value == ABSENT:  # else a reference and a literal have the same value
             own_value, default_value = value_at(nodes, key, raw), value_at(default_nodes, key, default_raw)
             changes.append({"key": key, "here": own_value, "default": default_value})
     return _without_secrets(changes)
-
-
-def _class_differs(key: str, nodes: Node, default_nodes: Node) -> bool:
-    """Return whether the node that contains a dotted key has different classes in two configs."""
-    target = f"{key.rpartition('.')[0]}._target_"
-    return value_at(nodes, target) != value_at(default_nodes, target)
 
 
 def _without_secrets(values: Any) -> Any:
@@ -303,15 +292,10 @@ def make_agent(node: Node, group: str, environment: Environment) -> Agent:
 def make_policy(
     policy: Node, checkpoint: Path, environment: Environment | None = None, *, is_own: bool = False
 ) -> Policy:
-    """Build the policy in a folder with the options of a policy node.
+    """Build the policy in the folder `checkpoint` with the options of a node, to act in `environment` if that is given.
 
-    Raises a UserError without a policy, if its spec does not fit, or if it names a path, address or untrusted class.
-
-    Args:
-        policy: the node.
-        checkpoint: the folder.
-        environment: in which the policy is to act.
-        is_own: the policy may name paths and addresses, because it is of this run, or was checked before.
+    Raises a UserError without a policy, if its spec does not fit, or if it names a path, address or untrusted class;
+    one that `is_own` may name paths and addresses, because it is of this run, or was checked before.
     """
     from vla.models.policy_folder import read_policy
 
@@ -319,7 +303,8 @@ def make_policy(
     if environment is not None:
         saved.spec.require_input(environment.spec, f"the policy {checkpoint}", "the task")
     if not is_own:
-        require_no_paths({**saved.config, "model": _model_node(saved.config, saved, weights=True)}, PARTS, checkpoint)
+        model_node = _model_node(saved.config, saved, weights=True)
+        require_no_paths({**saved.config, "model": model_node}, ("tokenizer", "model"), checkpoint)
     model = _model(saved.config, saved.spec, saved, weights=True)
     saved.restore(model)
     try:

@@ -76,10 +76,7 @@ class Validation:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Episodes of an evaluation, what they are to decide, and further conditions on the same seeds.
-
-    Raises a UserError if two conditions have the same name.
-    """
+    """Episodes of an evaluation, what they are to decide, and further conditions on the same seeds."""
 
     episodes: Count  # with `until`, at most
     seed: UnseenSeed  # of the first episode
@@ -95,7 +92,7 @@ class Evaluation:
     networks: dict[str, Changes]  # nodes of `vla.rollouts.realtime.Network`
 
     def __post_init__(self) -> None:
-        """Require that every condition has a name of its own."""
+        """Raise a UserError if two conditions have the same name."""
         names = [*self.conditions, *(name for name, _ in _split_levels(self.one_by_one))]
         for name, count in Counter([IN_DISTRIBUTION, *names, *self.agent_conditions]).items():
             if count > 1:
@@ -187,11 +184,8 @@ class Benchmark:
 def conditions(together: Mapping[str, Changes], one_by_one: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return condition → overrides of the task node: those of `together`, then each part of `one_by_one`.
 
-    A part at a level is named `part_level`, or `part` if all levels are equal; it is left out if null at every level.
-
-    Args:
-        together: condition → overrides.
-        one_by_one: level → argument of the task → part → value.
+    The latter is level → argument of the task → part → value. A part at a level is named `part_level`, or `part` if all
+    levels are equal; it is left out if null at every level.
     """
     return {**together, **dict(_split_levels(one_by_one))}
 
