@@ -45,9 +45,9 @@ def vla(folder: Path, *arguments: str, ok: bool = True) -> subprocess.CompletedP
 @cache
 def _default(folders: object, overrides: tuple[str, ...]) -> DictConfig:
     """The configuration of a job without other overrides, which every command compares its own with."""
-    from hydra import compose
+    from vla.config.compose import compose
 
-    return compose("config", list(overrides))
+    return compose(*overrides)
 
 
 def here(folder: Path, *arguments: str, ok: bool = True) -> subprocess.CompletedProcess[str]:
@@ -69,7 +69,7 @@ def here(folder: Path, *arguments: str, ok: bool = True) -> subprocess.Completed
             patch.object(sys, "argv", ["vla", *arguments]),
             patch.dict(os.environ),
             patch.object(Hydra, "get_mode", return_value=None),
-            patch("vla.run.compose", lambda name, overrides: _default(tuple(option_folders()), tuple(overrides))),
+            patch("vla.run.compose", lambda *overrides: _default(tuple(option_folders()), overrides)),
             chdir(folder),
             redirect_stdout(out),
             redirect_stderr(err),

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
-from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
@@ -27,8 +26,7 @@ from yaml import YAMLError
 from vla import jobs
 from vla.config.annotations import packages, targets
 from vla.config.check import check, devices
-from vla.config.compose import CONF, axes, copy_less, offer_axes, substitutes, with_variant
-from vla.config.compose import compose as compose_again
+from vla.config.compose import CONF, axes, compose, copy_less, offer_axes, substitutes, with_variant
 from vla.config.experiment import Experiment
 from vla.config.origin import SECRET
 from vla.config.packages import config_folders, offer_options, trust
@@ -169,13 +167,13 @@ def _run_job(cfg: DictConfig) -> float | None:
     trust(composed.get("trust"), [composed["job"], *targets(composed)], packages(composed))
     cfg = _merge_saved(cfg, overrides)
     job, option = jobs.find(cfg.job), HydraConfig.get().runtime.choices["job"]
-    make_default = partial(compose, "config", [f"job={option}"])
+    make_default = partial(compose, f"job={option}")
     experiment = Experiment.from_config(cfg, make_default)
     check(experiment, job)
     _require_sweepable(experiment, job.needs(experiment.nodes))
     if jobs.builds_world(experiment) and (replacements := substitutes(experiment["task"], overrides)):
         overrides += replacements
-        experiment = Experiment.from_config(_merge_saved(compose_again(*overrides), overrides), make_default)
+        experiment = Experiment.from_config(_merge_saved(compose(*overrides), overrides), make_default)
     return jobs.run(experiment)
 
 
