@@ -31,7 +31,7 @@ from vla.models.policy_folder import POLICY, read_policy, require_unseen
 from vla.policy import costs, torch_device
 from vla.reports.evaluation import plot_report, write_report
 from vla.reports.result_tables import conditions_table, plot_conditions, secondary_table
-from vla.reports.run_page import write_page
+from vla.reports.run_page import try_write_page
 from vla.rollouts.comparison import compare_conditions
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.memorisation import AgentWithoutModality, make_nearest, open_memory
@@ -42,20 +42,9 @@ from vla.rollouts.rollout import AgentFactory, EnvironmentFactory
 from vla.rollouts.shared_policy import shared_policy
 from vla.rollouts.statements import BarStatement, RunStatement, Statement, differs_clearly
 from vla.runs.files import readable_config
-from vla.runs.folder import (
-    CHECKPOINTS,
-    PAGE,
-    PLOT,
-    RECORDING,
-    RECORDINGS,
-    REPORT,
-    SUITE,
-    describe_files,
-    require_run,
-    save_config,
-)
+from vla.runs.folder import PLOT, RECORDING, RECORDINGS, REPORT, SUITE, describe_files, require_run, save_config
 from vla.runs.played import PlayedEpisodes
-from vla.runs.resume import cached_success
+from vla.runs.resume import cached_success, has_rounds
 from vla.schedule import Delays
 from vla.spec import FIRST_SEED, IN_DISTRIBUTION, Multitask
 
@@ -101,8 +90,7 @@ def evaluate_closed_loop(experiment: Experiment, checkpoint: Path | None) -> flo
     output, identity = experiment.output, _identity(experiment, checkpoint)
     weights = identity["weights"]
     if checkpoint and (success := cached_success(output, experiment.config, checkpoint, weights)) is not None:
-        with warn_on_error(output / PAGE):
-            write_page(output)  # once more, because a kill or a full disk may have left none, or an older one
+        try_write_page(output)  # once more, because a kill or a full disk may have left none, or an older one
         return success
     statements, conclusions = _statements(experiment), list[str]()
     _ = experiment.origin, experiment.changes  # determine them now, before the code may change
@@ -144,20 +132,13 @@ def _condition_identity(options: Evaluation, name: str) -> str:
 
 
 def agents_for_workers(experiment: Experiment, checkpoint: Path | None) -> AbstractContextManager[AgentFactory]:
-    """Return a context with the factory of a checkpoint's policy, which runs where `cluster.policy` says.
-
-    Without a checkpoint it is the factory of the agent of the config.
-    """
+    """Return a context with the factory of a checkpoint's policy, run where `cluster.policy` says, or of the agent."""
     if checkpoint is None:
         make_agent = experiment.make_agent()
         assert make_agent is not None, "there is an agent or a checkpoint"
         return nullcontext(make_agent)
     make_policy = experiment.make_policy(checkpoint.resolve())  # workers may be in another folder
-    return shared_policy(make_policy) if _is_shared(experiment) else nullcontext(make_policy)
-
-
-def _is_shared(experiment: Experiment) -> bool:
-    return experiment["cluster"].get("policy") == "here"
+    return shared_policy(make_policy) if experiment.build("cluster").policy == "here" else nullcontext(make_policy)
 
 
 def _conditions(experiment: Experiment, make_agent: AgentFactory) -> dict[str, tuple[EnvironmentFactory, AgentFactory]]:
@@ -195,10 +176,9 @@ def _play(
         clear_recordings(recordings)
     world = experiment.world() if options.until else None
     turns = len(world.tasks) if isinstance(world, Multitask) else 1
-    lanes = 1 if _is_shared(experiment) else (experiment["policy"] or {}).get("lanes", 1)  # shared: workers are lanes
-    play = partial(
-        evaluate, cluster=experiment.build("cluster"), turns=turns, lanes=lanes, recordings=options.recordings
-    )
+    cluster = experiment.build("cluster")
+    lanes = 1 if cluster.policy == "here" else (experiment["policy"] or {}).get("lanes", 1)  # here, workers are lanes
+    play = partial(evaluate, cluster=cluster, turns=turns, lanes=lanes, recordings=options.recordings)
     conditions, reports, seeds = _conditions(experiment, make_agent), dict[str, Report](), list(options.seeds)
     until = (lambda report: all(statement.is_decided(report) for statement in statements)) if statements else None
     for number, (name, (make_environment, make_its_agent)) in enumerate(conditions.items(), 1):
@@ -247,7 +227,7 @@ def require_possible(experiment: Experiment) -> None:
     if options.nearest is not None:
         open_memory(Path(options.nearest), None, experiment.world().spec)
     output = Path(settings.output)  # not created yet
-    if settings.job != "improve" and any(output.glob(f"round_*/{CHECKPOINTS}")):
+    if settings.job != "improve" and has_rounds(output):
         raise UserError(f"{output} has the rounds of a job=improve, whose report this would replace: add output=DIR")
     _require_own(experiment, output)
     # Worlds take time to compile: one is built for all conditions that change the same arguments; nodes were checked.
@@ -375,10 +355,7 @@ def _write(experiment: Experiment, checkpoint: Path | None, reports: dict[str, R
     if "recorded" in facts:  # only now: without a report the same command merges them again
         with warn_on_error(output / RECORDINGS):
             keep_pictures(report, output / RECORDINGS, options.recordings, {*facts["recorded"]})
-    page = None
-    with warn_on_error(output / PAGE):
-        page = write_page(output)
-    log.info("wrote %s", describe_files([page, output / REPORT, output / PLOT, recording]))
+    log.info("wrote %s", describe_files([try_write_page(output), output / REPORT, output / PLOT, recording]))
 
 
 def _errors(reports: Mapping[str, Report]) -> int:

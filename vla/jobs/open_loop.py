@@ -24,10 +24,10 @@ from vla.jobs.collect import demonstrations
 from vla.models.policy_folder import read_policy
 from vla.policy import costs
 from vla.reports.open_loop import components, errors_table, plot_errors, write_errors
-from vla.reports.run_page import write_page
+from vla.reports.run_page import try_write_page
 from vla.rollouts.open_loop import OpenLoop, open_loop
 from vla.rollouts.rollout import close_agent
-from vla.runs.folder import ERRORS, ERRORS_PLOT, PAGE, describe_files, save_config
+from vla.runs.folder import ERRORS, ERRORS_PLOT, describe_files, save_config
 from vla.spec import Array
 
 log = logging.getLogger(__name__)
@@ -66,9 +66,7 @@ def evaluate_open_loop(experiment: Experiment, checkpoint: Path | None) -> float
             plot_errors(result, output / ERRORS_PLOT)
         # Last, because its existence marks the evaluation as finished.
         write_errors(result, output / ERRORS, str(checkpoint) if checkpoint else None, experiment.config, facts)
-    page = None
-    with warn_on_error(output / PAGE):
-        page = write_page(output)
+    page = try_write_page(output)
     show(errors_table(components(result), len(result.seeds)))
     files = describe_files([page, output / ERRORS, output / ERRORS_PLOT])
     log.info("wrote %s: open-loop errors, which are not a success rate", files)

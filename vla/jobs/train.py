@@ -27,20 +27,10 @@ from vla.models.model import Model
 from vla.models.policy_folder import BEST, POLICY
 from vla.models.tokenizers.tokenizer import out_of_bounds, rounding
 from vla.models.trunk import is_within, trunks
-from vla.parallel.limits import cores
 from vla.reports.observations import SHOWN_WINDOWS, draw_samples
-from vla.reports.run_page import write_page
+from vla.reports.run_page import try_write_page
 from vla.runs.files import Training
-from vla.runs.folder import (
-    CHECKPOINTS,
-    LAST,
-    PAGE,
-    SAMPLES,
-    archive_evaluation,
-    read_training,
-    save_config,
-    save_training,
-)
+from vla.runs.folder import CHECKPOINTS, LAST, SAMPLES, archive_evaluation, read_training, save_config, save_training
 from vla.runs.resume import first_process, training_lock, training_progress
 from vla.training.checkpoints import GracefulStop
 from vla.training.closed_loop import ClosedLoop
@@ -237,8 +227,7 @@ def _closed_loop(experiment: Experiment) -> ClosedLoop | None:
     make_environment = experiment.make_environment(experiment.validate.changes)
     options = experiment["policy"]
     make_policy = partial(training_policy, options.get("precision", "fp32"), options.get("lanes", 1))
-    workers = experiment["cluster"].get("workers") or cores()
-    return ClosedLoop(make_environment, make_policy, seeds, experiment.output, workers)
+    return ClosedLoop(make_environment, make_policy, seeds, experiment.output, experiment.build("cluster").workers)
 
 
 @contextmanager
@@ -262,7 +251,6 @@ def _saving_result(
         if trainer.is_global_zero and (graceful_stop.started or training is None or end == "done" != training.ended):
             size = parameters, trainer.global_step, round(graceful_stop.seconds, 1)
             save_training(output, Training(*size, end, origins))
-            with warn_on_error(output / PAGE):
-                write_page(output)
+            try_write_page(output)
         end_wandb()
     log.info("trained %s in %.0f s", counted(trainer.global_step, "step"), graceful_stop.seconds)

@@ -9,6 +9,7 @@ from urllib.parse import quote
 from vla.config.differences import value_at
 from vla.data.index import INDEX, format_numbers, read_index
 from vla.io.errors import counted
+from vla.io.files import warn_on_error
 from vla.reports.factors import episode_panels
 from vla.reports.open_loop import errors_table
 from vla.reports.page import Section, render
@@ -31,11 +32,15 @@ ROUNDS = "Each round plays episodes with improve.changes and trains on the exper
 WINDOWS = "The newest images of each window, its instruction, and each component of the action within its range."
 
 
-def write_page(folder: Path) -> Path:
-    """Write the page of a run from the files in its folder, and return its path; missing files are omitted.
+def try_write_page(folder: Path) -> Path | None:
+    """Write the page of a run, see `write_page`; if that fails, warn and return None."""
+    with warn_on_error(folder / PAGE):
+        return write_page(folder)
+    return None
 
-    Raises a UserError if a file is damaged.
-    """
+
+def write_page(folder: Path) -> Path:
+    """Write the page of a run from whatever files its folder has; return its path. A UserError names a damaged one."""
     run = read_run(folder)
     report = run.reports.get(IN_DISTRIBUTION)
     conditions = run.report.conditions if run.report else {}

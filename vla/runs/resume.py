@@ -32,7 +32,7 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | N
     The first result is the checkpoint of an unfinished training, or None. The second is the folder of the policy that a
     finished training selected, or None; it needs no checkpoint. Both are None before the first save.
     """
-    if any(folder.glob(f"round_*/{CHECKPOINTS}")):
+    if has_rounds(folder):
         raise UserError(f"{folder} has the rounds of a job=improve: continue them by that job, or choose output=DIR")
     last, policy_folder = folder / CHECKPOINTS / LAST, folder / POLICY
     if last.exists():
@@ -59,6 +59,11 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | N
         raise UserError(f"trainer=fsdp cannot continue {last}, which was trained without it: use trainer=ddp")
     log.info("resuming from %s", last)
     return last, None
+
+
+def has_rounds(folder: Path) -> bool:
+    """Return whether a folder has the trainings of a job=improve."""
+    return any(folder.glob(f"round_*/{CHECKPOINTS}"))
 
 
 def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path, weights: str) -> float | None:
@@ -89,17 +94,13 @@ def newest_run(runs: Path) -> Path:
 
 @contextmanager
 def training_lock(folder: Path) -> Iterator[None]:
-    """Lock a folder of checkpoints, or of rounds; raise a UserError if another process holds the lock.
-
-    Only the first process of a training takes it.
-    """
+    """In a training's first process, lock a folder of checkpoints, or of rounds; a UserError if another process has."""
     if not first_process():
         yield
         return
     folder.mkdir(parents=True, exist_ok=True)
-    lock = try_lock(
-        folder / LOCK, f"another process is training in {folder}: wait for it, or choose another output=DIR"
-    )
+    busy = f"another process is training in {folder}: wait for it, or choose another output=DIR"
+    lock = try_lock(folder / LOCK, busy)
     try:
         yield
     finally:
