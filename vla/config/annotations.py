@@ -29,7 +29,7 @@ from vla.io.errors import UserError, suggestion
 
 # Configs also come from policies and stores of other people. A `_target_` may name a class of this package, one of
 # those that `conf/` uses, or one that the user trusts.
-OWN_PREFIX = "vla."
+OWN_PACKAGE, OWN_PREFIX = "vla", "vla."
 LIBRARY = (
     "lightning.Trainer",
     "lightning.pytorch.loggers.CSVLogger",
@@ -54,7 +54,7 @@ def locate(key: str, target: Any) -> type:
     require_trusted(key, target)
     if not isinstance(target, str) or not (target.startswith(OWN_PREFIX) or target in LIBRARY or is_trusted(target)):
         raise UserError(
-            f"{key} must name a class of {OWN_PREFIX.rstrip('.')}, of a package that trust=[…] names, or one of "
+            f"{key} must name a class of {OWN_PACKAGE}, of a package that trust=[…] names, or one of "
             f"{', '.join(LIBRARY)}, got {target!r}"
         )
     module, _, name = target.rpartition(".")
@@ -67,10 +67,7 @@ def locate(key: str, target: Any) -> type:
         kind, hint = (MissingLibrary, install_hint(str(error.name))) if library else (UserError, "")
         raise kind(f"{key} is {target}, which cannot be imported{place}: {error}{hint}") from error
     # A module's attributes include its imports, such as `os`.
-    if not isinstance(attribute, type) or attribute.__module__.partition(".")[0] not in (
-        OWN_PREFIX.rstrip("."),
-        package,
-    ):
+    if not isinstance(attribute, type) or attribute.__module__.partition(".")[0] not in (OWN_PACKAGE, package):
         raise UserError(f"{key} must name a class that is defined in {package}, got {target!r}")
     return attribute
 
