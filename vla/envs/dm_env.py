@@ -9,7 +9,8 @@ import numpy as np
 from dm_env import TimeStep, specs
 
 from vla.config.compose import make_task
-from vla.spec import FIRST_SEED, Array, Environment, Observation
+from vla.envs.gym import GymEnvironment
+from vla.spec import FIRST_SEED, Array, Environment
 
 
 class DmEnvironment(dm_env.Environment):
@@ -21,26 +22,25 @@ class DmEnvironment(dm_env.Environment):
 
     def __init__(self, environment: Environment, random_state: int | np.random.RandomState | None = None) -> None:
         """Wrap an environment; `random_state` draws the seeds of episodes, which are below those of evaluation."""
-        self.environment, self._episode_over = environment, True
+        self.environment, self._adapted, self._episode_over = environment, GymEnvironment(environment), True
         is_generator = isinstance(random_state, np.random.RandomState)
         self.random_state = random_state if is_generator else np.random.RandomState(random_state)
 
     def reset(self, seed: int | None = None) -> TimeStep:
         """Start the episode of `seed`, or of a random seed."""
-        episode = int(self.random_state.randint(FIRST_SEED)) if seed is None else seed
         self._episode_over = False
-        return dm_env.restart(_arrays(self.environment.reset(episode)))
+        episode = int(self.random_state.randint(FIRST_SEED)) if seed is None else seed
+        return dm_env.restart(_with_array(self._adapted.reset(seed=episode)[0]))
 
     def step(self, action: Array) -> TimeStep:
         """Apply one (D,) action for one control period, or start a new episode after the last one ended."""
         if self._episode_over:
             return self.reset()
-        observation = _arrays(self.environment.step(action))
-        self._episode_over = self.environment.done
-        outcome = self.environment.outcome
-        if outcome == "success" or (self._episode_over and outcome == "failure"):
-            return dm_env.termination(float(outcome == "success"), observation)
-        return dm_env.truncation(0.0, observation) if self._episode_over else dm_env.transition(0.0, observation)
+        values, reward, terminated, truncated, _ = self._adapted.step(action)
+        self._episode_over = terminated or truncated
+        if terminated:
+            return dm_env.termination(reward, _with_array(values))
+        return (dm_env.truncation if truncated else dm_env.transition)(0.0, _with_array(values))
 
     def observation_spec(self) -> dict[str, specs.Array]:
         """Return the shapes and dtypes of an observation."""
@@ -67,8 +67,5 @@ def load(task: str, random_state: int | np.random.RandomState | None = None, **o
     return DmEnvironment(make_task(task, **overrides), random_state)
 
 
-def _arrays(observation: Observation) -> dict[str, Array]:
-    # Copies, because a world may reuse its arrays; contiguous for torch.
-    images = {camera: np.array(image, order="C") for camera, image in observation.rgb.items()}
-    state, instruction = np.array(observation.state, np.float32), np.array(observation.instruction, dtype=object)
-    return {**images, "state": state, "instruction": instruction}
+def _with_array(values: dict[str, Any]) -> dict[str, Array]:
+    return {**values, "instruction": np.array(values["instruction"], dtype=object)}
