@@ -31,9 +31,10 @@ from vla.io.errors import UserError
 from vla.rollouts.evaluate import play_episode
 from vla.rollouts.remote import RemotePolicy
 from vla.spec import FIRST_SEED, Array
-from vla.tasks.libero.environment import action_of, command_of
+from vla.tasks.libero.controller import REACH
 from vla.tasks.libero.expert import Planner
 from vla.tasks.libero.package import CHANGES, SUITES, tasks_of
+from vla.tasks.world import action_of, command_of
 
 ONE = [*PLAIN, "task.suite=object", "task.tasks=[0]"]
 CONDITIONS = ("positions", "objects", "sentences", "tasks")
@@ -100,7 +101,7 @@ def expert_behind_openpi(asked: list[dict[str, Any]]) -> Iterator[str]:
                 for command in commands[:5]:
                     if not environment.done:
                         action = expert.act(seen)
-                        command[:] = command_of(action)
+                        command[:] = command_of(action, REACH)
                         seen = environment.step(action)
                 connection.send(pack({"actions": commands, "server_timing": {"infer_ms": 1.0}}))
 
@@ -175,7 +176,7 @@ def test_human_demonstrations_become_episodes_of_this_world(tmp_path: Path) -> N
     found = [store.read(entry) for entry in store.episodes]
     np.testing.assert_array_equal(np.concatenate([one["state"] for one in found]), states)
     np.testing.assert_allclose(
-        np.concatenate([one["action"] for one in found]), [action_of(one) for one in commands], atol=1e-6
+        np.concatenate([one["action"] for one in found]), [action_of(one, REACH) for one in commands], atol=1e-6
     )
     left, right = found[0]["rgb_agentview"][0, 24, [2, 45], 0].astype(int)
     assert left < 20 and right > 235  # neither mirrored once more nor cropped

@@ -36,8 +36,9 @@ from vla.rollouts.collect import collect
 from vla.rollouts.rollout import rollout
 from vla.spec import Array, Environment, Multitask, Observation, Spec
 from vla.tasks.metaworld import package
-from vla.tasks.metaworld.environment import MetaWorld, _command
+from vla.tasks.metaworld.environment import REACH, MetaWorld
 from vla.tasks.metaworld.expert import Scripted
+from vla.tasks.world import command_of
 
 LEROBOT = (0.75, 0.075, 0.7)  # where it puts the camera corner2 [m]
 
@@ -57,7 +58,7 @@ def test_a_policy_trained_on_lerobots_data_gives_the_commands_of_meta_world() ->
     theirs = np.array([1.0, -0.5, 0.25, 1.0])  # the last closes
     ours = [each.scale * theirs[each.index] for each in map(instantiate, asked.actions.values())]
     assert [*asked.actions] == list(world().spec.action) and asked.images.corner2 == "observation/image"
-    np.testing.assert_allclose(_command(np.array(ours)), theirs)
+    np.testing.assert_allclose(command_of(np.array(ours), REACH), theirs)
 
 
 def test_a_seed_is_the_same_episode_also_where_memory_is_scarce_and_tasks_are_compiled_again(

@@ -1,4 +1,4 @@
-"""What worlds share: the state of an episode, steps without images, and named random streams."""
+"""What worlds share: the state of an episode, steps without images, named random streams, commands of a gripper."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from vla.io.errors import UserError
 from vla.parallel.limits import is_memory_scarce
+from vla.spec import Array
 
 FREE = 0.25  # share of the memory that scenes leave free
 Scene = TypeVar("Scene")
@@ -72,6 +73,18 @@ class MultitaskWorld(World):
         """Free physics and GL of all scenes."""
         while self._scenes:
             self._scenes.popitem()[1].close()
+
+
+def command_of(action: Array, reach: Array | float) -> Array:
+    """Convert an action (D,), motion up to `reach` and then a gripper with 1 for open, to a command (D,) of -1…1, with
+    1 for a closed gripper."""
+    return np.append(action[:-1] / reach, -action[-1])
+
+
+def action_of(command: Array, reach: Array | float) -> Array:
+    """Convert a command (D,) to the action (D,) float32 that gives it, clipped to its bounds."""
+    clipped = np.clip(command, -1, 1)
+    return np.append(reach * clipped[:-1], -clipped[-1]).astype(np.float32)
 
 
 class Streams:

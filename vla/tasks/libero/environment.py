@@ -18,7 +18,7 @@ from vla.tasks.libero.package import ALL, STATES, Task, folders, suites_of, task
 from vla.tasks.libero.scene import BURNER, VISIBLE, Detail, load_scene
 from vla.tasks.libero.starts import Randomize, Starts, set_start
 from vla.tasks.rendering.renderer import LazyRenderer, RendererFactory, Views
-from vla.tasks.world import MultitaskWorld
+from vla.tasks.world import MultitaskWorld, command_of
 
 CONTROL_HZ = 20.0
 STATE = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z", "finger_1", "finger_2")
@@ -137,7 +137,8 @@ class Libero(MultitaskWorld):
     def step(self, action: Array) -> Observation:
         """Apply one (7,) action, clipped to the spec's bounds, for one control period."""
         self._require_running()
-        self._scene.controller.step(self._scene.data, command_of(np.clip(action, self.spec.low, self.spec.high)))
+        action = np.clip(action, self.spec.low, self.spec.high)
+        self._scene.controller.step(self._scene.data, command_of(action, REACH))
         self._steps_taken += 1
         if self._goal.is_reached(self._scene.data):
             self.outcome = "success"
@@ -256,14 +257,3 @@ def _materials(model: mujoco.MjModel, task: Task) -> list[list[int]]:
 def _things(task: Task) -> set[str]:
     """Return the names of the movable things in a scene."""
     return {part[1] for part in task.initial if part[0] in ("on", "in")} - task.fixtures.keys()
-
-
-def command_of(action: Array) -> Array:
-    """Convert an action (7,), with 1 for an open gripper, to a command (7,) of -1…1, with 1 for a closed one."""
-    return np.array([*np.asarray(action[:6]) / REACH, -action[6]])
-
-
-def action_of(command: Array) -> Array:
-    """Convert a command (7,) of LIBERO to the action (7,) float32 that gives it, clipped to its bounds."""
-    clipped = np.clip(command, -1, 1)
-    return np.array([*(REACH * clipped[:6]), -clipped[6]], np.float32)

@@ -13,7 +13,8 @@ import numpy as np
 
 from vla.io.errors import UserError
 from vla.spec import Array, Observation, Spec
-from vla.tasks.libero.environment import STATE, action_of
+from vla.tasks.libero.controller import REACH
+from vla.tasks.libero.environment import STATE
 from vla.tasks.libero.goal import CABINET, Predicate
 from vla.tasks.libero.grasps import choose_grasp, room_of
 from vla.tasks.libero.package import ALL, tasks_of
@@ -33,6 +34,7 @@ from vla.tasks.libero.skills import (
     twist,
     withdraw,
 )
+from vla.tasks.world import action_of
 
 DRAWERS = ("wooden_cabinet", "white_cabinet", "yellow_cabinet")  # what must be open for something to be put in
 HOLLOWS = (*DRAWERS, "microwave")  # into which things are brought all the way
@@ -70,7 +72,7 @@ class Planner:
             self._known[key] = Situation(tasks_of(ALL[key[0]])[key[1]])
         situation = self._known[key]
         situation.take(truth)
-        return action_of(decide(situation))
+        return action_of(decide(situation), REACH)
 
 
 def decide(situation: Situation) -> Array:

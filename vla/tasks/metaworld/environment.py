@@ -15,7 +15,7 @@ from vla.spec import Array, Observation, Spec
 from vla.tasks.metaworld.package import tasks_of
 from vla.tasks.metaworld.scene import CAMERA, TaskScene, parts_of
 from vla.tasks.rendering.renderer import RendererFactory
-from vla.tasks.world import MultitaskWorld
+from vla.tasks.world import MultitaskWorld, command_of
 
 CONTROL_HZ = 80.0  # five substeps of 2.5 ms
 REACH = 0.01  # largest displacement of the hand per step, along each axis [m]
@@ -119,7 +119,8 @@ class MetaWorld(MultitaskWorld):
     def step(self, action: Array) -> Observation:
         """Apply one (4,) action, clipped to the spec's bounds, for one control period."""
         self._require_running()
-        observation, solved = self._scene.step(_command(np.clip(action, self.spec.low, self.spec.high)))
+        action = np.clip(action, self.spec.low, self.spec.high)
+        observation, solved = self._scene.step(command_of(action, REACH).astype(np.float32))
         self.outcome = "success" if solved else "timeout"
         self._steps_taken += 1
         self.done = solved or self._steps_taken == self._steps
@@ -141,14 +142,3 @@ class MetaWorld(MultitaskWorld):
             instruction=self._sentences[self.task],
             truth=truth,
         )
-
-
-def _command(action: Array) -> Array:
-    """Convert an action, displacement [m] and gripper with 1 for open, to Meta-World's, with 1 for closed."""
-    return np.array([*np.asarray(action[:3]) / REACH, -action[3]], np.float32)
-
-
-def action_of(command: Array) -> Array:
-    """Convert a command (4,) of Meta-World to the action (4,) float32 that gives it, clipped to its bounds."""
-    clipped = np.clip(command, -1, 1)
-    return np.array([*(REACH * clipped[:3]), -clipped[3]], np.float32)

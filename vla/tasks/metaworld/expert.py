@@ -9,8 +9,9 @@ from metaworld.policies import ENV_POLICY_MAP
 
 from vla.io.errors import UserError
 from vla.spec import Array, Observation, Spec
-from vla.tasks.metaworld.environment import STATE, action_of
+from vla.tasks.metaworld.environment import REACH, STATE
 from vla.tasks.metaworld.package import VERSION, tasks_of
+from vla.tasks.world import action_of
 
 
 class Scripted:
@@ -36,4 +37,4 @@ class Scripted:
         truth = observation.require_truth("expert=metaworld")
         if self._expert is None:
             self._expert = ENV_POLICY_MAP[self._names[int(truth["task"][0])] + VERSION]()
-        return action_of(np.asarray(self._expert.get_action(truth["observation"])))
+        return action_of(np.asarray(self._expert.get_action(truth["observation"])), REACH)
