@@ -74,9 +74,8 @@ class Gymnasium(World):
             success: path of the flag that is true in a successful step.
             truth: name → path of an array, for training and experts only.
 
-        Raises:
-            UserError: the package is not installed or does not contain the environment, an action has no bounds, an
-                observation lacks a path or has no numbers there, or arguments do not fit each other.
+        Raises a UserError if the package is not installed or does not contain the environment, an action has no bounds,
+        an observation lacks a path or has no numbers there, or arguments do not fit each other.
         """
         super().__init__()
         self._truth, self._images, self._success, self._instruction = truth or {}, images, success, instruction

@@ -24,10 +24,8 @@ class Perturbation:
     """Excursions, missed grasps and action noise.
 
     An excursion moves the tool at full speed towards a random point for a few steps, with the gripper, if there is one,
-    open or closed at random. Only a gripper misses grasps.
-
-    Raises:
-        UserError: `low`, `high` and `move` differ in length, or `low` exceeds `high`.
+    open or closed at random. Only a gripper misses grasps. Raises a UserError if `low`, `high` and `move` differ in
+    length, or `low` exceeds `high`.
     """
 
     low: Corner  # lower corner of the box of excursion targets, in the frame of the actions [m]
@@ -49,7 +47,6 @@ class Perturbation:
     pace: PositiveRange
 
     def __post_init__(self) -> None:
-        """Check that the corners have one coordinate per component of `move`, and span a box."""
         low, high, move = len(self.low), len(self.high), len(self.move)
         if not low == high == move:
             raise UserError(f"expert.perturb.low, high and move must be equally long, not {low}, {high} and {move}")
@@ -80,10 +77,8 @@ class Perturbation:
     def __call__(self, clean: Array, truth: dict[str, Array], must_turn: bool = False, steady: bool = False) -> Array:
         """Return the (D,) action to execute instead of `clean`, not yet clipped to the bounds of the spec.
 
-        With `must_turn` the gripper also turns in episodes without turns; with `steady` no excursion begins.
-
-        Raises:
-            UserError: the truth has no such tool.
+        With `must_turn` the gripper also turns in episodes without turns; with `steady` no excursion begins. Raises a
+        UserError if the truth has no such tool.
         """
         tool, coordinates = truth.get(self.tool), len(self.low)
         if tool is None or tool.shape != (coordinates,):

@@ -38,8 +38,7 @@ class Recorded(SpecOnly):
         joints: components that are positions of the robot's joints, base to tip; "all": all components of the action;
             None: no deployment as a ROS 2 node.
 
-    Raises:
-        UserError: arguments contradict each other, or a joint has no unit of a position.
+    Raises a UserError if arguments contradict each other, or a joint has no unit of a position.
     """
 
     def __init__(

@@ -25,7 +25,7 @@ class Controller:
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Args: the model of a scene."""
+        """Take the model of a scene."""
         self._model = model
         joint = model.joint("robot0_joint1")  # of seven in a row
         self._qpos = slice(joint.qposadr[0], joint.qposadr[0] + 7)

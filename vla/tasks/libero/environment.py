@@ -75,8 +75,7 @@ class Libero(MultitaskWorld):
             settle: steps before the first observation, in which things come to rest.
             tiers: suite → tasks, or patterns such as goal*_3, for reports.
 
-        Raises:
-            UserError: the wheels are missing, or there is no such suite.
+        Raises a UserError if the wheels are missing, or there is no such suite.
         """
         super().__init__()
         folders()  # raise now, because an evaluation attributes an error in `reset` to that episode
@@ -170,11 +169,7 @@ class Scene:
     """Physics of a scene, its controller, its renderer, and the starts and goals of its tasks."""
 
     def __init__(self, task: Task, renderer: RendererFactory, spec: Spec, detail: Detail) -> None:
-        """Args: a task in it; renderer; the world's spec; detail of the pictures.
-
-        Raises:
-            UserError: there is no such camera.
-        """
+        """Compile the scene of a task, for the cameras of the world's spec; a UserError if it lacks one of them."""
         self.model = model = load_scene(task.scene, _things(task), detail)
         self.data = mujoco.MjData(model)
         self._starts: dict[str, tuple[Starts, Goal]] = {}

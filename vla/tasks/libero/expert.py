@@ -51,11 +51,7 @@ class Planner:
     memoryless = True
 
     def __init__(self, *, spec: Spec) -> None:
-        """Args: the environment's spec.
-
-        Raises:
-            UserError: it is not that of LIBERO.
-        """
+        """Act in an environment of this spec; a UserError if it is not that of LIBERO."""
         if spec.state != STATE:
             raise UserError("expert=libero acts in task=libero only: choose the expert of this task")
         self.info: dict[str, Any] = {}
@@ -90,11 +86,9 @@ def decide(situation: Situation) -> Array:
         if thing == held_thing:  # the hand is needed to open the drawer
             return _open_fingers(situation)
         displacement = way_off_drawer_path(situation, thing, int(situation.goal.joints(place)[0]))
-        return (
-            pull(situation, place)
-            if displacement is None or not situation.upright
-            else drag(situation, thing, displacement)
-        )
+        if displacement is None or not situation.upright:
+            return pull(situation, place)
+        return drag(situation, thing, displacement)
     if name == "open":
         return pull(situation, thing)
     if not situation.upright:
@@ -127,11 +121,9 @@ def _release(situation: Situation, thing: str | None) -> Array:
         if np.linalg.norm(place.spot - situation.origin(predicate.thing)) > ARRIVED:
             # It counts as there, but it is not down or not far enough in yet.
             return carry(situation, predicate.thing, place)
-    return (
-        let_go(situation, predicate.thing)
-        if predicate is not None and predicate.name == "on"
-        else _open_fingers(situation)
-    )
+    if predicate is not None and predicate.name == "on":
+        return let_go(situation, predicate.thing)
+    return _open_fingers(situation)
 
 
 def _deliver(situation: Situation, thing: str, destination: str, held: bool) -> Array:
@@ -151,7 +143,5 @@ def _is_shut(situation: Situation, place: str, slack: float) -> bool:
     """Return whether a place is in a drawer that must be opened first; it may lack `slack` [m] of being open."""
     if place in situation.goal.bodies or not situation.subject(place).startswith(DRAWERS):
         return False
-    joints = situation.goal.joints(place)
-    return (
-        bool(len(joints)) and not (situation.data.qpos[situation.model.jnt_qposadr[joints]] < CABINET[0] + slack).any()
-    )
+    turns = situation.data.qpos[situation.model.jnt_qposadr[situation.goal.joints(place)]]
+    return bool(len(turns)) and not (turns < CABINET[0] + slack).any()

@@ -36,7 +36,7 @@ class Goal:
     """A conjunction of predicates on things: bodies named `THING_main`, or sites, the regions."""
 
     def __init__(self, model: mujoco.MjModel, goal: Sequence[Sequence[str]]) -> None:
-        """Args: the model of a scene; predicates with their arguments, as in `Task.goal`."""
+        """Take the model of a scene, and predicates with their arguments, as in `Task.goal`."""
         self._model = model
         self.parts = sorted((Predicate(*part) for part in goal), key=lambda part: ORDER.index(part.name))
         names = [model.body(number).name for number in range(model.nbody)]

@@ -64,11 +64,8 @@ class Task:
 
 @cache
 def folders() -> dict[str, Path]:
-    """Return prefix of file names in the scenes → folder of a wheel.
-
-    Raises:
-        UserError: a wheel is missing or has another version.
-    """
+    """Return prefix of file names in the scenes → folder of a wheel; a UserError if one is missing or of another
+    version."""
     for name, expected_version in WHEELS.items():
         try:
             found_version = version(name)
@@ -101,11 +98,8 @@ def suites_of(name: str) -> list[str]:
 
 @cache
 def tasks_of(suite: str) -> tuple[Task, ...]:
-    """Return the tasks of a suite, such as "goal" or "spatial_swap", in the benchmark's order.
-
-    Raises:
-        UserError: there is no such suite.
-    """
+    """Return the tasks of a suite, such as "goal" or "spatial_swap", in the benchmark's order; a UserError if there is
+    no such suite."""
     if suite not in ALL:
         raise UserError(
             f"LIBERO has no suite {suite!r}: it has {', '.join(SUITES)}, and LIBERO-PRO each of them with "
@@ -125,11 +119,8 @@ def scene_xml(name: str) -> str:
 
 
 def initial_states(task: Task) -> Array:
-    """Return the official initial states of a task (`STATES`, 1 + nq + nv): time, positions and velocities.
-
-    Raises:
-        UserError: the wheel does not have them.
-    """
+    """Return the official initial states of a task (`STATES`, 1 + nq + nv): time, positions and velocities; a UserError
+    if the wheel does not have them."""
     path = folders()["@libero"] / "libero/init_files" / f"{task.states}.npz"
     try:
         with np.load(io.BytesIO(path.read_bytes())) as content:

@@ -33,7 +33,7 @@ class Situation:
     """A task in one state."""
 
     def __init__(self, task: Task) -> None:
-        """Args: the task."""
+        """Take the task; it has no state yet."""
         self.task, self.model = task, load_scene(task.scene, (), None)
         self.data, self.goal = mujoco.MjData(self.model), Goal(self.model, task.goal)
         self._shapes = {name: self._shape(root) for name, root in self.goal.bodies.items()}

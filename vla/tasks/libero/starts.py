@@ -42,11 +42,7 @@ class Starts:
     """Starts of one task."""
 
     def __init__(self, model: mujoco.MjModel, task: Task) -> None:
-        """Args: the model of the scene; the task.
-
-        Raises:
-            UserError: the official states are of another model.
-        """
+        """Take the model of the scene and the task; a UserError if the official states are of another model."""
         states = initial_states(task)
         if states.shape[1] != 1 + model.nq + model.nv:
             raise UserError(

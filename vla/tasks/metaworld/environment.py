@@ -73,8 +73,7 @@ class MetaWorld(MultitaskWorld):
             shadows: edge of the shadow map [texels]; 0: no shadows.
             steps: largest number of steps of an episode.
 
-        Raises:
-            UserError: a task is unknown or has no sentence, or pictures would be stretched.
+        Raises a UserError if a task is unknown or has no sentence, or pictures would be stretched.
         """
         super().__init__()
         all_tasks = self._all_tasks = tasks_of("mt50")  # the truth gives a task by its index here

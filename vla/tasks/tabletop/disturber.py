@@ -65,10 +65,7 @@ class Disturber:
     def update(self, step: int, state: WorldState, subgoal: Subgoal) -> bool:
         """Continue a push or a drop, or start a disturbance that is due; return whether an object was moved.
 
-        Args:
-            step: index of the control step that comes next.
-            state: state before it.
-            subgoal: current subgoal.
+        `step` is the index of the control step that comes next, `state` the one before it.
         """
         self._steps_left = max(0, self._steps_left - 1)
         if self._steps_left:

@@ -74,8 +74,7 @@ class Tabletop(World):
             shadows: whether the lamp casts shadows.
             robot: an arm from a file; None: the Panda.
 
-        Raises:
-            UserError: more blocks than colours, a robot that does not work, or a machine that cannot render.
+        Raises a UserError for more blocks than colours, a robot that does not work, or a machine that cannot render.
         """
         super().__init__()
         require_backend()

@@ -202,10 +202,8 @@ class Simulation:
     def follow(self, joints: Array, opening: float, seconds: float) -> None:
         """Step physics for `seconds` with targets interpolated linearly to `joints` (J,) [rad] and an opening 0…1.
 
-        After a push the arm returns to these targets, because its driver does not know of the push.
-
-        Raises:
-            UserError: `seconds` is no whole number of physics steps.
+        After a push the arm returns to these targets, because its driver does not know of the push. Raises a UserError
+        if `seconds` is no whole number of physics steps.
         """
         substeps = round(seconds / self._timestep)
         if not math.isclose(substeps * self._timestep, seconds):

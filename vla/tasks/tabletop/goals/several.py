@@ -26,11 +26,8 @@ class Mixed:
     """
 
     def __init__(self, goals: Mapping[str, Goal | None], impossible: Share, silent: Share) -> None:
-        """Take name → goal, None to omit it, and the shares of episodes with an absent block and with no instruction.
-
-        Raises:
-            UserError: no goal remains, or the shares exceed one.
-        """
+        """Take name → goal, None to omit it, and the shares of episodes with an absent block and with no instruction
+        (UserError: no goal remains, or the shares exceed one)."""
         self.goals = _require_goals(goals)
         if impossible + silent > 1:
             raise UserError(f"task.goal.impossible + task.goal.silent must be at most 1, not {impossible + silent:g}")

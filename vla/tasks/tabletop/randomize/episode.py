@@ -55,15 +55,8 @@ class TargetChoice:
 
 
 def paraphrase(instruction: str, words: Mapping[str, str], names: Iterable[str]) -> str:
-    """Replace phrases of an instruction, the longest first, so that none of the `names` remains.
-
-    Args:
-        words: phrase → what replaces it.
-        names: what the instruction names, such as colours.
-
-    Raises:
-        UserError: nothing is replaced, or a name remains.
-    """
+    """Replace phrases of an instruction by their `words`, the longest first, so that none of the `names`, such as
+    colours, remains (UserError: nothing is replaced, or a name remains)."""
     phrases = sorted(words, key=len, reverse=True)
     sentence = re.sub(rf"\b({'|'.join(map(re.escape, phrases))})\b", lambda match: words[match[0]], instruction)
     if sentence == instruction or set(names) & set(re.findall(r"\w+", sentence)):
