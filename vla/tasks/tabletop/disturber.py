@@ -15,13 +15,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Literal
 
 import numpy as np
 
 from vla.spec import Array
 from vla.tasks.tabletop.compiled_scene import CompiledScene, Disturbance
-from vla.tasks.tabletop.goals.goal import Subgoal, WorldState
+from vla.tasks.tabletop.goals.goal import Spot, Subgoal, WorldState
 from vla.tasks.tabletop.outcome import CLEAR
 from vla.tasks.tabletop.scene import PAD_RADIUS
 
@@ -33,8 +32,6 @@ BESIDE = 0.09  # horizontal distance from the gripper at which the object can be
 GAP = 0.02  # between a moved object and its neighbours [m]
 DIRECTIONS = 24  # largest number of directions to try
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # between a direction and the next one to try [rad]
-
-Target = tuple[Literal["pad", "block"], int]  # kind and index of the object at the destination of a subgoal
 
 
 class Disturber:
@@ -106,7 +103,7 @@ class Disturber:
             self._steps_left = max(1, math.ceil(self._disturbance.distance / PUSH_STEP))
             self.motion = self.offset = np.append(place - state.tool[:2], 0.0) / self._steps_left
             return f"push: the arm is pushed by {distance}"
-        target: Target | None = ("block", subgoal.block) if kind == "move_block" else _target(state, subgoal)
+        target: Spot | None = ("block", subgoal.block) if kind == "move_block" else _target(state, subgoal)
         if target is None or (place := self._free_place(state, target)) is None:
             return ""
         object_kind, index = target
@@ -121,11 +118,11 @@ class Disturber:
             if (place >= self._disturbance.low).all() and (place <= self._disturbance.high).all():
                 yield place
 
-    def _free_place(self, state: WorldState, target: Target) -> Array | None:
+    def _free_place(self, state: WorldState, target: Spot) -> Array | None:
         """Return the first place (2,) for an object away from its neighbours and the gripper, or None."""
         object_kind, index = target
         radii = np.linalg.norm(state.extents, axis=1)  # of the blocks, whatever face is up
-        things: dict[Target, tuple[Array, float]] = {
+        things: dict[Spot, tuple[Array, float]] = {
             ("pad", pad): (centre, PAD_RADIUS) for pad, centre in enumerate(state.pads)
         }
         things |= {("block", block): (centre, radii[block]) for block, centre in enumerate(state.positions)}
@@ -141,7 +138,7 @@ class Disturber:
         return None
 
 
-def _target(state: WorldState, subgoal: Subgoal) -> Target | None:
+def _target(state: WorldState, subgoal: Subgoal) -> Spot | None:
     """Return the pad, else the other block that rests on the table, at the destination of a subgoal."""
     for pad, place in enumerate(state.pads):
         if subgoal.skill != "hold" and np.array_equal(place[:2], subgoal.destination[:2]):

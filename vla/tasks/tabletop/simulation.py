@@ -126,7 +126,7 @@ class Simulation:
         """Start the clock of a request, with the blocks where they are now."""
         self.current, request = number, self.requests[number]
         self.goal, self.referents, self.instruction = request.goal, request.referents, request.instruction
-        self._cached: tuple[float, WorldState] | None = None  # simulation time [s] and state
+        self._state: WorldState | None = None  # of this moment, where it was measured
         self._starts, self._lifts = self.compiled.block_centres(), np.zeros(self.compiled.present)
         self.classifier = OutcomeClassifier(self.goal.hold_steps)
         self._periods, self._most_periods = 0, round(self._time_limit * self.goal.moves * CONTROL_HZ)
@@ -237,7 +237,7 @@ class Simulation:
         targets = commands.copy()
         # A lead compensates the damping of the servos, so that the arm does not lag.
         targets[:, :-1] += robot.lead / self._timestep * increment[:-1]
-        self._command = commands[-1]
+        self._command, self._state = commands[-1], None
         controls = np.concatenate([self._late_controls, self.compiled.controls(targets)])
         self._late_controls = controls[substeps:]
         ctrl = data.ctrl
@@ -260,14 +260,12 @@ class Simulation:
             subgoals = self.goal.subgoals(state, self.referents)
         if self.disturber and not self.is_over and self.disturber.update(self._steps, state, current_subgoal(subgoals)):
             mujoco.mj_step1(self.compiled.model, self.compiled.data)  # poses and contacts after the move
-            self._cached = None
+            self._state = None
 
     def world_state(self) -> WorldState:
         """Return the current true state."""
-        time = float(self.compiled.data.time)
-        if self._cached is None or self._cached[0] != time:
-            self._cached = time, self._measure()
-        return self._cached[1]
+        self._state = self._state or self._measure()
+        return self._state
 
     def _measure(self) -> WorldState:
         compiled, data, present = self.compiled, self.compiled.data, self.compiled.present

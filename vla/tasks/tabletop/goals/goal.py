@@ -21,7 +21,7 @@ SLOTS = frozenset({"block", "other", "pad", "rest", "absent"})  # of instruction
 
 Skill = Literal["place", "hold", "push", "stay"]
 SKILLS: tuple[Skill, ...] = ("place", "hold", "push", "stay")
-Spot = tuple[Literal["pad", "block"], int]  # where a block can be put, by the index of the pad or of the block below
+Spot = tuple[Literal["pad", "block"], int]  # a pad or a block, by its index, where a block can be put
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,7 @@ def current_subgoal(subgoals: Sequence[Subgoal]) -> Subgoal:
     return next((subgoal for subgoal in subgoals if not subgoal.done), subgoals[-1])
 
 
+@dataclass(eq=False)
 class Goal(ABC):
     """One kind of task.
 
@@ -118,14 +119,16 @@ class Goal(ABC):
     """
 
     named, moves, blocks, absent, pads = 1, 1, 2, 0, 1
+    language: Grammar
+    hold_steps: Count
 
-    def __init__(self, language: Grammar, hold_steps: Count) -> None:
+    def __post_init__(self) -> None:
+        language = self.language
         slots = ["block", "other"][: self.named] + ["pad", "rest"][: self.pads] + ["absent"] * bool(self.absent)
         if extra_slots := sorted(language.slots - set(slots)):
             raise UserError(f"task.goal.language has the slots {extra_slots}, but {type(self).__name__} fills {slots}")
         if clash := sorted(SLOTS & {*language.words, *language.held_out_words}):
             raise UserError(f"task.goal.language has words for {', '.join(clash)}, slots that goals fill: rename them")
-        self.language, self.hold_steps = language, hold_steps
 
     @property
     def name(self) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Le
 
-from vla.io.types import Inherited, Positive
+from vla.io.types import Positive
 from vla.tasks.tabletop.goals.goal import AT_REST, Arrangement, Goal, Referents, Subgoal, WorldState
 from vla.tasks.tabletop.language import Grammar, Silence
 from vla.tasks.tabletop.scene import PADS
@@ -22,13 +23,11 @@ REST_STEPS = 15  # consecutive control steps for which it must rest
 UNMOVED = 0.01  # largest displacement of a block that counts as none [m]
 
 
+@dataclass(eq=False)
 class Lift(Goal):
     """Lift the named block and keep it up."""
 
-    def __init__(self, height: Positive, **inherited: Inherited) -> None:
-        """Take the required height above the start [m]."""
-        super().__init__(**inherited)
-        self.height = height
+    height: Positive  # required above the start [m]
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
         """Hold the block a little above the required height."""
@@ -45,13 +44,11 @@ class Lift(Goal):
         return arrangement.lift(block) if possible else None
 
 
+@dataclass(eq=False)
 class PickPlace(Goal):
     """Put the named block on the pad and let go of it."""
 
-    def __init__(self, radius: Positive, **inherited: Inherited) -> None:
-        """Take the maximum distance between the centres of block and pad [m]."""
-        super().__init__(**inherited)
-        self.radius = radius
+    radius: Positive  # maximum distance between the centres of block and pad [m]
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
         """Place the block on the pad's centre."""
@@ -86,16 +83,13 @@ class Place(PickPlace):
         return arrangement.put(block, ("pad", pad)) if arrangement.can_grasp(block) else None
 
 
+@dataclass(eq=False)
 class Push(Goal):
     """Push the named block onto the named pad without lifting it."""
 
     pads = 2
-
-    def __init__(self, radius: Positive, highest: Positive, **inherited: Inherited) -> None:
-        """Take the largest distance between the centres of block and pad, and the largest rise of the block above its
-        start, while the instruction is carried out [m]."""
-        super().__init__(**inherited)
-        self.radius, self.highest = radius, highest
+    radius: Positive  # largest distance between the centres of block and pad [m]
+    highest: Positive  # largest rise of the block above its start, while the instruction is carried out [m]
 
     def subgoals(self, state: WorldState, referents: Referents) -> list[Subgoal]:
         """Push the block onto the pad's centre."""
