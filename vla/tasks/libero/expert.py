@@ -13,6 +13,7 @@ import numpy as np
 
 from vla.io.errors import UserError
 from vla.spec import Array, Observation, Spec
+from vla.tasks.libero import skills
 from vla.tasks.libero.controller import REACH
 from vla.tasks.libero.environment import STATE
 from vla.tasks.libero.goal import CABINET, Predicate
@@ -20,20 +21,6 @@ from vla.tasks.libero.grasps import choose_grasp, room_of
 from vla.tasks.libero.package import ALL, tasks_of
 from vla.tasks.libero.places import place_of, way_off_drawer_path
 from vla.tasks.libero.situation import HELD, THIN, Situation
-from vla.tasks.libero.skills import (
-    TWIST,
-    approach,
-    back_off,
-    carry,
-    command,
-    drag,
-    is_over,
-    let_go,
-    pull,
-    push,
-    twist,
-    withdraw,
-)
 from vla.tasks.world import action_of
 
 DRAWERS = ("wooden_cabinet", "white_cabinet", "yellow_cabinet")  # what must be open for something to be put in
@@ -80,28 +67,28 @@ def decide(situation: Situation) -> Array:
     if touched_thing is not None and all(situation.subject(part.thing) != touched_thing for part in todo):
         return _release(situation, held_thing)
     if held_thing is None and _is_put_down(situation, todo):
-        return _open_fingers(situation) if situation.opening < LOOSENED else back_off(situation)
+        return _open_fingers(situation) if situation.opening < LOOSENED else skills.back_off(situation)
     name, thing, place = next((part for part in todo if part.thing == held_thing), todo[0])
     if name in ("on", "in") and _is_shut(situation, place, SLIPPED if thing == held_thing else 0.0):
         if thing == held_thing:  # the hand is needed to open the drawer
             return _open_fingers(situation)
         displacement = way_off_drawer_path(situation, thing, int(situation.goal.joints(place)[0]))
         if displacement is None or not situation.upright:
-            return pull(situation, place)
-        return drag(situation, thing, displacement)
+            return skills.pull(situation, place)
+        return skills.drag(situation, thing, displacement)
     if name == "open":
-        return pull(situation, thing)
+        return skills.pull(situation, thing)
     if not situation.upright:
-        return withdraw(situation)
+        return skills.withdraw(situation)
     if name in ("turnon", "turnoff"):
-        return twist(situation, thing, TWIST if name == "turnon" else -TWIST)
+        return skills.twist(situation, thing, skills.TWIST if name == "turnon" else -skills.TWIST)
     if name == "close":
-        return push(situation, thing)
+        return skills.push(situation, thing)
     return _deliver(situation, thing, place, thing == held_thing)
 
 
 def _open_fingers(situation: Situation) -> Array:
-    return command(situation, situation.hand, situation.yaw, -1.0, situation.lean)
+    return skills.command(situation, situation.hand, situation.yaw, -1.0, situation.lean)
 
 
 def _is_put_down(situation: Situation, todo: Sequence[Predicate]) -> bool:
@@ -110,7 +97,7 @@ def _is_put_down(situation: Situation, todo: Sequence[Predicate]) -> bool:
     part = next((part for part in todo if situation.subject(part.thing) == thing), None)
     if thing is None or part is None:
         return thing is not None
-    return part.name in ("on", "in") and is_over(situation, thing, place_of(situation, thing, part.place, True))
+    return part.name in ("on", "in") and skills.is_over(situation, thing, place_of(situation, thing, part.place, True))
 
 
 def _release(situation: Situation, thing: str | None) -> Array:
@@ -120,9 +107,9 @@ def _release(situation: Situation, thing: str | None) -> Array:
         place = place_of(situation, predicate.thing, predicate.place, True)
         if np.linalg.norm(place.spot - situation.origin(predicate.thing)) > ARRIVED:
             # It counts as there, but it is not down or not far enough in yet.
-            return carry(situation, predicate.thing, place)
+            return skills.carry(situation, predicate.thing, place)
     if predicate is not None and predicate.name == "on":
-        return let_go(situation, predicate.thing)
+        return skills.let_go(situation, predicate.thing)
     return _open_fingers(situation)
 
 
@@ -130,13 +117,13 @@ def _deliver(situation: Situation, thing: str, destination: str, held: bool) -> 
     """Bring a thing to where it is to be."""
     place = place_of(situation, thing, destination, held)
     if held:
-        return carry(situation, thing, place)
+        return skills.carry(situation, thing, place)
     grasp = choose_grasp(situation, thing, place)
     if place.current_exit is not None and (grasp is None or room_of(situation, thing, grasp) < NARROW):
-        return drag(situation, thing, place.current_exit)
+        return skills.drag(situation, thing, place.current_exit)
     if grasp is None:
-        return drag(situation, thing, (place.spot - situation.origin(thing)) * (1, 1, 0))
-    return approach(situation, grasp, situation.points(thing), thing)
+        return skills.drag(situation, thing, (place.spot - situation.origin(thing)) * (1, 1, 0))
+    return skills.approach(situation, grasp, situation.points(thing), thing)
 
 
 def _is_shut(situation: Situation, place: str, slack: float) -> bool:

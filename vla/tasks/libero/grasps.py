@@ -47,11 +47,9 @@ def choose_grasp(situation: Situation, thing: str, place: Place) -> Grasp | None
     points = situation.points(thing)
     # Whichever of its axes is up.
     is_tilted = np.abs(situation.data.xmat[situation.goal.bodies[thing], 6:]).max() < UPRIGHT
-    kinds = (
-        (crest(points),)
-        if is_tilted
-        else (grasps_across(points), walls(points), parts(situation.pieces(thing)), leaning_grasps(points))
-    )
+    kinds = [crest(points)]
+    if not is_tilted:
+        kinds = [grasps_across(points), walls(points), parts(situation.pieces(thing)), leaning_grasps(points)]
     best_grasp: Grasp | None = None
     lowest_cost = hindrance = math.inf  # cost of the best one, and the part of it that is due to its kind and obstacles
     for base_cost, kind in zip(KINDS, kinds, strict=False):

@@ -56,9 +56,8 @@ def _hidden(situation: Situation, thing: str, held: bool) -> Array | None:
 def way_off_drawer_path(situation: Situation, thing: str, joint: int) -> Array | None:
     """Return the displacement (3,) [m] of a thing out of a drawer's way; None: it is not in the way, or blocked."""
     drawer = np.concatenate(situation.moved_points(joint))
-    distances = np.linspace(
-        0, situation.model.jnt_range[joint, 0] - situation.data.qpos[situation.model.jnt_qposadr[joint]], 5
-    )
+    opening = situation.data.qpos[situation.model.jnt_qposadr[joint]]
+    distances = np.linspace(0, situation.model.jnt_range[joint, 0] - opening, 5)
     path = np.concatenate([drawer + distance * situation.data.xaxis[joint] for distance in distances])
     return way_out(situation, thing, path[path[:, 2] > situation.points(thing)[:, 2].max()], False, ASIDE)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -36,8 +37,11 @@ class Situation:
         """Take the task; it has no state yet."""
         self.task, self.model = task, load_scene(task.scene, (), None)
         self.data, self.goal = mujoco.MjData(self.model), Goal(self.model, task.goal)
-        self._shapes = {name: self._shape(root) for name, root in self.goal.bodies.items()}
-        self._sparse = {name: _sparse(list(shapes.values())) for name, shapes in self._shapes.items()}
+        self._shapes, owners = self._read_shapes(), self.goal.owner
+        self._bodies = {
+            name: [body for body in self._shapes if owners[body] == root] for name, root in self.goal.bodies.items()
+        }
+        self._sparse = {name: _sparse([self._shapes[body] for body in bodies]) for name, bodies in self._bodies.items()}
         self._placements: dict[int, tuple[Array, list[Array]]] = {}
         self._site = self.model.site("gripper0_grip_site").id
         self.base = self.model.body("robot0_base").pos.copy()  # of the arm (3,) [m]
@@ -88,10 +92,9 @@ class Situation:
         """Return the origin (3,) of a thing [m]."""
         return self.data.xpos[self.goal.bodies[thing]]
 
-    def pieces(self, thing: str, body: int | None = None) -> list[Array]:
-        """Return points (N, 3) on each geom of a thing, or of one of its bodies [m]."""
-        shapes = self._shapes[thing]
-        return [points for number in ([body] if body is not None else shapes) for points in self._place(thing, number)]
+    def pieces(self, thing: str) -> list[Array]:
+        """Return points (N, 3) on each geom of a thing [m]."""
+        return [points for body in self._bodies[thing] for points in self._place(body)]
 
     def points(self, thing: str) -> Array:
         """Return points (N, 3) on the surface of a thing [m]."""
@@ -101,9 +104,7 @@ class Situation:
 
     def moved_points(self, joint: int) -> list[Array]:
         """Return points (N, 3) on each geom of the body that a joint moves [m]."""
-        body = int(self.model.jnt_bodyid[joint])
-        thing = next(name for name, root in self.goal.bodies.items() if root == self.goal.owner[body])
-        return self.pieces(thing, body)
+        return self._place(int(self.model.jnt_bodyid[joint]))
 
     def surroundings(self, thing: str, middle: Array, radius: float) -> Array:
         """Return points (N, 3) on all but one thing, in a square of half width `radius` about `middle` (2,) [m]."""
@@ -115,7 +116,7 @@ class Situation:
     @cached_property
     def all_points(self) -> tuple[Array, Array]:
         """Points (N, 3) on all things [m], and the bodies (N,) that they belong to."""
-        points = [self.points(thing)[self._sparse[thing]] for thing in self._shapes]
+        points = [self.points(thing)[rows] for thing, rows in self._sparse.items()]
         owners = [np.full(len(cloud), body) for cloud, body in zip(points, self.goal.bodies.values(), strict=True)]
         return np.concatenate(points), np.concatenate(owners)
 
@@ -155,22 +156,18 @@ class Situation:
         is_held = (owners == root) | np.isin(pairs, [body for finger in self._fingers for body in finger])
         return bool(np.isin(owners[is_held.any(axis=1)], list(self._movable - {root})).any())
 
-    def _place(self, thing: str, body: int) -> list[Array]:
+    def _place(self, body: int) -> list[Array]:
         """Return points (N, 3) on each geom of a body [m], which are cached until the body moves."""
         pose = np.concatenate([self.data.xpos[body], self.data.xmat[body]])
         if body not in self._placements or not np.array_equal(self._placements[body][0], pose):
             turn = pose[3:].reshape(3, 3).T
-            self._placements[body] = pose, [local @ turn + pose[:3] for local in self._shapes[thing].get(body, [])]
+            self._placements[body] = pose, [local @ turn + pose[:3] for local in self._shapes.get(body, [])]
         return self._placements[body][1]
 
-    def _shape(self, root: int) -> dict[int, list[Array]]:
-        """Return body → points (N, 3) on each of its geoms, in its frame, for all bodies of the thing at `root`."""
-        shapes: dict[int, list[Array]] = {}
-        model = self.model
-        for geom in range(model.ngeom):
-            body = int(model.geom_bodyid[geom])
-            if self.goal.owner[body] != root:
-                continue
+    def _read_shapes(self) -> dict[int, list[Array]]:
+        """Return body → points (N, 3) on each of its geoms, in its frame [m], for all bodies of things."""
+        model, shapes = self.model, defaultdict[int, list[Array]](list)
+        for geom in np.flatnonzero(self.goal.owner[model.geom_bodyid]):
             if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
                 points = mesh_triangles(model, int(model.geom_dataid[geom]))[0]
             else:
@@ -178,7 +175,7 @@ class Situation:
                 points = _surface(model.geom_size[geom][[0, 0, 1]] if round_ else model.geom_size[geom])
             turn = np.empty(9)
             mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-            shapes.setdefault(body, []).append(points @ turn.reshape(3, 3).T + model.geom_pos[geom])
+            shapes[int(model.geom_bodyid[geom])].append(points @ turn.reshape(3, 3).T + model.geom_pos[geom])
         return shapes
 
 

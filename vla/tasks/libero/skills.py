@@ -124,9 +124,8 @@ def let_go(situation: Situation, thing: str) -> Array:
     # Height of the hand over the ground once the thing is straight.
     standing = situation.hand @ up - (points @ up).min()
     hangs = up[2] < STRAIGHT and situation.hand[2] - points[:, 2].min() > standing + 0.002
-    return command(
-        situation, situation.hand - (0.01 * UP if hangs else 0.0), situation.yaw, 1.0 if hangs else -1.0, situation.lean
-    )
+    lower, grip = (0.01 * UP, 1.0) if hangs else (0.0, -1.0)
+    return command(situation, situation.hand - lower, situation.yaw, grip, situation.lean)
 
 
 def equivalent_grasp(situation: Situation, grasp: Grasp) -> Grasp:
@@ -181,10 +180,7 @@ def pull(situation: Situation, place: str) -> Array:
     rotation = min(turns, key=lambda turn: float(np.linalg.norm(_turn(situation, turn))))
     offset = situation.hand - middle
     distance = float(offset @ axis)
-    deviation, angle = (
-        float(np.linalg.norm(offset - distance * axis)),
-        float(np.linalg.norm(_turn(situation, rotation))),
-    )
+    deviation, angle = map(np.linalg.norm, (offset - distance * axis, _turn(situation, rotation)))
     if deviation < 1.5 * NEAR and angle < 2 * TURNED and abs(distance) < 2 * LEVEL:
         grips = situation.opening < FIRM and situation.gap > THIN
         return move(situation, middle + (0.012 if grips else 0.0) * axis, rotation, 1.0)  # slowly, or the fingers slip
@@ -202,10 +198,8 @@ def twist(situation: Situation, thing: str, turn: float) -> Array:
     pieces = situation.moved_points(joint)
     grasp = min(parts(pieces, alone=False), key=lambda pair: pair[0] + 0.02 * abs(situation.turn_to(pair[1].yaw)))[1]
     grasp = Grasp(np.array([*situation.data.xanchor[joint][:2], grasp.position[2]]), grasp.yaw)
-    holds = (
-        situation.opening < FIRM and situation.gap > THIN and np.linalg.norm(situation.hand - grasp.position) < 3 * NEAR
-    )
-    if holds:
+    is_near = np.linalg.norm(situation.hand - grasp.position) < 3 * NEAR
+    if is_near and situation.opening < FIRM and situation.gap > THIN:
         return command(situation, grasp.position, situation.yaw + turn, 1.0)
     return approach(situation, grasp, np.concatenate(pieces), thing)
 
@@ -250,10 +244,9 @@ def withdraw(situation: Situation) -> Array:
     obstacles = situation.surroundings("", situation.hand, 0.1)
     if len(obstacles) and np.linalg.norm(obstacles - situation.hand, axis=1).min() < 0.09:
         return back_off(situation)
-    inwards = situation.base - situation.hand  # so that the arm is not stretched
-    return command(
-        situation, situation.hand + np.array([*(0.05 * inwards[:2] / np.hypot(*inwards[:2])), 0.02]), 0.0, -1.0
-    )
+    inwards = (situation.base - situation.hand)[:2]  # so that the arm is not stretched
+    step = np.array([*(0.05 * inwards / np.hypot(*inwards)), 0.02])
+    return command(situation, situation.hand + step, 0.0, -1.0)
 
 
 def back_off(situation: Situation) -> Array:
