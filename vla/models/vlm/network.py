@@ -21,7 +21,7 @@ from vla.io.types import Count, Layers, Width
 MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0  # of the time embedding
 
 Rotation = tuple[Tensor, Tensor]  # cosines and sines of positions, (B, N, H) each
-LayerOutput = tuple[Tensor, Tensor, Tensor]  # tokens after a layer, (B, N, E), and their keys and values in it
+LayerOutput = tuple[Tensor, Tensor, Tensor]  # tokens after a layer, (B, N, E), and all keys and values they attend to
 
 
 class Prefix(NamedTuple):
@@ -33,29 +33,26 @@ class Prefix(NamedTuple):
 
 
 class LayerCache:
-    """Keys and values of the tokens of a layer, which attend to preceding tokens too.
+    """All keys and values that the tokens of a layer attend to: those of preceding tokens, and their own.
 
     It takes the place of a cache of transformers, but nothing is added to the preceding ones: a prefix never changes.
 
     Args:
-        past: keys and values of preceding tokens, (B, heads, P, width of a head) each.
+        past: keys and values of preceding tokens, (B, heads, P, width of a head) each; None: there are none.
     """
 
     keys: Tensor
     values: Tensor
 
-    def __init__(self, past: tuple[Tensor, Tensor] | None = None) -> None:
-        self._others = past
+    def __init__(self, past: tuple[Tensor, Tensor] | None) -> None:
+        self._past = past
 
     def update(self, keys: Tensor, values: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
-        """Keep (B, heads, N, width of a head) keys and values, and return all that the tokens attend to.
-
-        Versions of transformers differ in what else they pass.
-        """
+        """Append (B, heads, N, width of a head) keys and values; versions of transformers pass more."""
+        if past := self._past:
+            keys, values = torch.cat([past[0], keys], 2), torch.cat([past[1], values], 2)
         self.keys, self.values = keys, values
-        if self._others is None:
-            return keys, values
-        return torch.cat([self._others[0], keys], 2), torch.cat([self._others[1], values], 2)
+        return keys, values
 
 
 class KeyValueMixin(nn.Module):

@@ -83,7 +83,7 @@ class PaliGemmaWithExpert(FlowNetwork):
             condition: further arguments of every layer.
 
         Returns:
-            The tokens, (B, N, E), not normalised, and their keys and values as a prefix.
+            The tokens, (B, N, E), not normalised, and a prefix of all that they attended to.
         """
         key_mask = present if prefix is None else torch.cat([prefix.present, present], 1)  # (B, P + N)
         positions = key_mask.cumsum(1)[:, -hidden.shape[1] :] - 1
@@ -93,10 +93,10 @@ class PaliGemmaWithExpert(FlowNetwork):
         for number, layer in enumerate(gemma.layers):
             pair = None if prefix is None else (prefix.keys[number], prefix.values[number])
             attention = {"attention_mask": mask, "position_embeddings": rotation, "past": pair}
-            hidden, own_keys, own_values = layer(hidden, **attention, **condition)
-            keys.append(own_keys)
-            values.append(own_values)
-        return hidden, Prefix(tuple(keys), tuple(values), present)
+            hidden, layer_keys, layer_values = layer(hidden, **attention, **condition)
+            keys.append(layer_keys)
+            values.append(layer_values)
+        return hidden, Prefix(tuple(keys), tuple(values), key_mask)
 
 
 def _trunk(text: dict[str, Any], vision: dict[str, Any]) -> PaliGemmaModel:
@@ -117,12 +117,3 @@ def _expert(sizes: dict[str, int]) -> GemmaModel:
     del expert.embed_tokens
     return_keys(expert, _GemmaLayer)
     return expert
-
-
-def concatenate_prefixes(first: Prefix, second: Prefix) -> Prefix:
-    """Concatenate two prefixes."""
-    keys, values = (
-        tuple(torch.cat(pair, 2) for pair in zip(*layers, strict=True))
-        for layers in ((first.keys, second.keys), (first.values, second.values))
-    )
-    return Prefix(keys, values, torch.cat([first.present, second.present], 1))

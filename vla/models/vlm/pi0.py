@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from vla.io.types import Inherited, Width
 from vla.models.vlm.network import Prefix, with_time
-from vla.models.vlm.paligemma import PaliGemmaWithExpert, concatenate_prefixes
+from vla.models.vlm.paligemma import PaliGemmaWithExpert
 
 
 class PI0(PaliGemmaWithExpert):
@@ -35,9 +35,7 @@ class PI0(PaliGemmaWithExpert):
         assert state is not None
         trunk_prefix = super().prefix(images, cameras, tokens, sentence, None)
         token = self.state_proj(state).unsqueeze(1)
-        return concatenate_prefixes(
-            trunk_prefix, self.attend(self.expert, token, sentence.new_ones(len(token), 1), trunk_prefix)[1]
-        )
+        return self.attend(self.expert, token, sentence.new_ones(len(token), 1), trunk_prefix)[1]
 
     def velocity(self, prefix: Prefix, noisy: Tensor, time: Tensor) -> Tensor:
         """Predict the velocity of (B, k, A) noisy actions at times (B,) or (B, k)."""
