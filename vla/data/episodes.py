@@ -93,18 +93,20 @@ class EpisodeStore:
                 write_header(folder, spec, plain_config, codec or Codec.for_spec(spec))
         store = cls(folder)
         spec.require(store.spec, "this task", f"the episode store {folder}")
-        store.require(plain_config)
-        store.require_codec(codec)
+        store.require(plain_config, codec)
         return store
 
-    def require(self, config: Mapping[str, Any]) -> None:
-        """Raise a UserError if the episodes have another config; a derived store, chosen explicitly, may have any."""
-        if self.is_derived:
-            return
+    def require(self, config: Mapping[str, Any], codec: Codec | None) -> None:
+        """Raise a UserError if the episodes have another config, except in a derived store, which is chosen explicitly,
+        or the images other losses than those of `codec`; None accepts any."""
         new_config, stored_config = canonicalize(json.loads(dumps(config))), canonicalize(self.config)
         keys = sorted(key for key in {*new_config, *stored_config} if new_config.get(key) != stored_config.get(key))
-        if keys:
+        if keys and not self.is_derived:
             raise UserError(f"{self.folder} has episodes of another {', '.join(keys)}: set another collect.folder")
+        if codec is not None and codec.loss != self.codec.loss:
+            raise UserError(
+                f"{self.folder} holds {self.codec}, not {codec}: set another collect.folder, or omit collect.images"
+            )
 
     def lacks(self, key: str, node: Any) -> bool:
         """Return whether the store is derived, and no part of it has `node` under `key` in its config."""
@@ -112,13 +114,6 @@ class EpisodeStore:
         return self.is_derived and all(
             canonicalize(config.get(key)) != plain_node for config, _ in self.config["parts"]
         )
-
-    def require_codec(self, codec: Codec | None) -> None:
-        """Raise a UserError if the images have other losses than those of `codec`; None accepts any."""
-        if codec is not None and codec.loss != self.codec.loss:
-            raise UserError(
-                f"{self.folder} holds {self.codec}, not {codec}: set another collect.folder, or omit collect.images"
-            )
 
     def require_first_seed(self, seed: int) -> None:
         """Raise a UserError if the first episode has another seed; a derived store may begin anywhere."""

@@ -59,8 +59,7 @@ def complete_store(experiment: Experiment) -> EpisodeStore | None:
     if not is_store(Path(collection.folder)):
         return None
     store = EpisodeStore(Path(collection.folder))
-    store.require(experiment.source)
-    store.require_codec(collection.codec)
+    store.require(experiment.source, collection.codec)
     store.require_first_seed(collection.seed)
     return store if len(store.episodes) >= collection.episodes else None
 
