@@ -78,14 +78,10 @@ class _LastLayer(nn.Module):
     def __init__(self, layer: Any) -> None:
         super().__init__()
         self.input_layernorm, self.self_attn = layer.input_layernorm, layer.self_attn
-        self.self_attn.q_proj, self.self_attn.o_proj = (
-            _UnusedWeights(layer.self_attn.q_proj),
-            _UnusedWeights(layer.self_attn.o_proj),
-        )
-        self.post_attention_layernorm, self.mlp = (
-            _UnusedWeights(layer.post_attention_layernorm),
-            _UnusedWeights(layer.mlp),
-        )
+        self.self_attn.q_proj = _UnusedWeights(layer.self_attn.q_proj)
+        self.self_attn.o_proj = _UnusedWeights(layer.self_attn.o_proj)
+        self.post_attention_layernorm = _UnusedWeights(layer.post_attention_layernorm)
+        self.mlp = _UnusedWeights(layer.mlp)
 
     def forward(self, hidden: Tensor, position_embeddings: Rotation, **_: Any) -> LayerOutput:
         """Return (B, N, E) tokens unchanged, with their keys and values."""
