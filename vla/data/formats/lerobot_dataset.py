@@ -161,11 +161,8 @@ class LeRobotDataset:
             steps, number = order[start:end], row[OWNER]
             times = stamps[steps, 0]
             if len(steps) != (count := row[END] - row[START]) or not count:
-                content, remedy = (
-                    f"{len(steps)} steps of episode {number}",
-                    REMEDY if len(steps) < count else CORRECTION,
-                )
-                raise UserError(f"{self.folder}/data holds {content}, and meta/episodes counts {count}: {remedy}")
+                content = f"{len(steps)} steps of episode {number}, and meta/episodes counts {count}"
+                raise UserError(f"{self.folder}/data holds {content}: {REMEDY if len(steps) < count else CORRECTION}")
             self._require_even(number, times - times[0])
             files = tuple(paths[index] for index in np.unique(file[steps]))
             # Actions after a change of the task do not follow the instruction before it.
