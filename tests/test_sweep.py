@@ -127,6 +127,8 @@ def test_cells_that_failed_are_left_out_and_a_sweep_without_any_writes_nothing(t
     cell(tmp_path, 1, ["model=bc", "seed=0"], 9)
     cell(tmp_path, 2, ["model=rt1", "seed=0"], 9)
     (tmp_path / "2/error.txt").write_text("holds a training that differs in model")  # the report is of another sweep
+    cell(tmp_path, 3, [], 9)
+    (tmp_path / "3/.hydra/overrides.yaml").unlink()  # a run that somebody put into the folder
     (row,) = tabulate(tmp_path)
     assert row.choices == {} and row.name == "all"
     failed = "2 model=rt1: holds a training that differs in model"

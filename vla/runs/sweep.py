@@ -72,8 +72,8 @@ def read_rows(folder: Path) -> list[SweepRow]:
     """Read the rows of all cells that have a report and did not fail, in the order of the sweep."""
     evaluations = [
         (overrides_of(cell), read_run(cell))
-        for cell in cells(folder, REPORT)
-        if not (cell / FAILURE).exists()  # its report may be of other overrides
+        for cell in cells(folder, OVERRIDES)  # other folders with a report are no cells
+        if (cell / REPORT).exists() and not (cell / FAILURE).exists()  # the report may be of other overrides
     ]
     keys = [key for key in varied_keys([overrides for overrides, _ in evaluations]) if key != SEED]
     rows: dict[tuple[str, ...], SweepRow] = {}
