@@ -26,7 +26,7 @@ from vla.tasks.world import action_of
 DRAWERS = ("wooden_cabinet", "white_cabinet", "yellow_cabinet")  # what must be open for something to be put in
 HOLLOWS = (*DRAWERS, "microwave")  # into which things are brought all the way
 SLIPPED = 0.03  # by how much a drawer may close while a thing is brought into it, before the thing is let go [m]
-ARRIVED = 0.015  # distance from its place at which a thing is all the way in [m]
+ARRIVED = 0.008  # distance from its place at which a thing is all the way in [m]
 LOOSENED = 0.5  # commanded opening at which fingers no longer drag along what they let go
 NARROW = 0.006  # free room around the hand below which a thing under another one is first dragged out [m]
 
