@@ -274,7 +274,7 @@ def test_a_knob_at_zero_is_not_off_and_the_planner_turns_it_further() -> None:
         ("long 1", 481),  # a flat box beside a carton
         ("long 7", 297),  # a tin in a basket, off which the hand must turn
         ("long 8", 88),  # pots by their handles
-        ("long 9", 41),  # a mug that rolls a little out of a microwave when it is let go at its edge
+        ("long 9", 41),  # a mug that slides out of a microwave if it is let go as soon as it counts as inside
     ],
 )
 def test_the_planner_solves(name: str, seed: int) -> None:
