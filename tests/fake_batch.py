@@ -26,7 +26,7 @@ from vla.models.vision.image_tokenizer import FilmConv
 from vla.policy import Policy
 from vla.spec import ActionStatistics, Spec
 
-TINY_IMAGE = partial(FilmConv, [8, 8], [5, 3], [2, 1], chroma=True, positions=False)
+TINY_IMAGE = partial(FilmConv, [8, 8], [5, 3], [2, 1], chroma=True, positions=False, log_pixels=False)
 OF_CONTEXT = ("history", "learned_tokens", "keypoints", "proprioception")
 TINY_TEXT = partial(NGrams, **defaults_of("model/text/ngrams", vocabulary=64, dropout=0.0))
 

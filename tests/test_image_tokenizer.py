@@ -21,7 +21,7 @@ def test_film_scales_and_shifts_every_channel() -> None:
 
 
 def test_film_conv_listens_to_the_text() -> None:
-    encoder = FilmConv([4, 6], [5, 3], [2, 2], text_width=8, chroma=True, positions=False)
+    encoder = FilmConv([4, 6], [5, 3], [2, 2], text_width=8, chroma=True, positions=False, log_pixels=False)
     images = torch.rand(1, 3, 16, 16).expand(2, -1, -1, -1)
     features = encoder(images, torch.randn(2, 8))
     assert features.shape == (2, 6, 4, 4) and not torch.allclose(features[0], features[1])
@@ -29,7 +29,7 @@ def test_film_conv_listens_to_the_text() -> None:
 
 def test_with_chroma_alone_a_dimmer_lamp_changes_little() -> None:
     torch.manual_seed(0)
-    encoder = FilmConv([8], [5], [2], text_width=8, chroma=True, positions=False)
+    encoder = FilmConv([8], [5], [2], text_width=8, chroma=True, positions=False, log_pixels=False)
     torch.nn.init.zeros_(encoder.get_parameter("convs.0.weight"))  # so that only relative colours are left
     bright, text = 0.3 + 0.7 * torch.rand(1, 3, 16, 16), torch.randn(1, 8)
     with torch.no_grad():
@@ -54,7 +54,7 @@ def test_logarithms_keep_contrasts_on_a_dark_table(log_pixels: bool, at_least: f
 
 
 def test_features_can_tell_their_position() -> None:
-    encoder = FilmConv([4], [3], [1], text_width=8, chroma=True, positions=True)
+    encoder = FilmConv([4], [3], [1], text_width=8, chroma=True, positions=True, log_pixels=False)
     features = encoder(torch.rand(2, 3, 5, 7), torch.randn(2, 8))
     assert features.shape == (2, 4 + 2, 5, 7) == (2, encoder.channels, 5, 7)
     x, y = features[1, -2:]
@@ -64,7 +64,7 @@ def test_features_can_tell_their_position() -> None:
 
 def test_film_conv_wants_lists_of_one_length() -> None:
     with pytest.raises(ValueError, match="kernels and strides must be equally many"):
-        FilmConv([4, 6], [5], [2, 2], text_width=8, chroma=True, positions=False)
+        FilmConv([4, 6], [5], [2, 2], text_width=8, chroma=True, positions=False, log_pixels=False)
 
 
 def test_tokens_first_attend_to_a_few_positions() -> None:

@@ -51,6 +51,14 @@ def test_a_tree_is_dirty_if_its_code_is(tree: Path) -> None:
     assert find_origin().commits["mine"].endswith(" with uncommitted changes")
 
 
+def test_trees_of_one_name_are_told_apart(tree: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    other = tmp_path / "other/mine"
+    git(tmp_path, "clone", "-q", str(tree), str(other))
+    git(other, "commit", "-q", "--allow-empty", "-m", "more")
+    monkeypatch.setattr(origin, "config_folders", lambda: (tree / "conf", other / "conf"))
+    assert find_origin().commits == {str(folder): git(folder, "rev-parse", "HEAD") for folder in (tree, other)}
+
+
 def test_code_that_is_in_no_tree_has_no_commit(tree: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(origin, "config_folders", lambda: (tmp_path, tmp_path / "missing"))
     assert find_origin().commits == {}

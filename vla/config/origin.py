@@ -29,7 +29,7 @@ class Origin:
     __pydantic_config__ = STRICT
 
     command: str  # empty if it is unknown; secrets are replaced by asterisks
-    commits: dict[str, str]  # name of a git work tree with code → its commit, and whether it is dirty
+    commits: dict[str, str]  # git work tree with code (name, or path if two share it) → commit, and whether dirty
     host: str
     processor: str
 
@@ -63,7 +63,8 @@ def _commits() -> dict[str, str]:
             if _git(folder, "--no-optional-locks", "status", "--porcelain", "--", ".") or DIRTY in trees.get(tree, ""):
                 commit = f"{commit} {DIRTY}"
             trees[tree] = commit
-    return {Path(tree).name: commit for tree, commit in trees.items()}
+    names = [Path(tree).name for tree in trees]
+    return {tree if names.count(name) > 1 else name: trees[tree] for tree, name in zip(trees, names, strict=True)}
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

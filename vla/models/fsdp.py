@@ -46,8 +46,10 @@ def gather_weights(model: nn.Module) -> Iterator[None]:
     """Gather all weights in every process, for calls that bypass `forward`; the weights must not be changed."""
     for part in _sharded_parts(model):
         part.unshard()
-    yield
-    reshard(model)
+    try:
+        yield
+    finally:
+        reshard(model)
 
 
 def _sharded_parts(model: nn.Module) -> Iterator[FSDPModule]:

@@ -86,7 +86,7 @@ class FilmConv(ImageEncoder):
         strides: Kernels,
         chroma: bool,
         positions: bool,
-        log_pixels: bool = False,  # not in the config of older checkpoints
+        log_pixels: bool,
         *,
         text_width: int,
     ) -> None:
