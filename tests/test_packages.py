@@ -195,6 +195,8 @@ def test_its_demonstrations_are_described_replayed_and_exported(home: Path, impo
     assert "add trust=[mypackage]" in here(home, *replay, ok=False).stderr
     assert "bit for bit" in here(home, *replay, "trust=[mypackage]").stdout
     assert (home / "replay/episode-0.rrd").stat().st_size > 1000
+    assert "bit for bit" in here(home, *replay, "trust=[mypackage]", "recorder=mine").stdout
+    assert (home / "replay/recordings/0.jsonl").is_file()
     here(home, "job=export", "experiment=mine", *TINY, "collect.folder=copy", "export.folder=files")
     state = json.loads((home / "files/episode_00000/step_0000/robot_state.json").read_text())
     assert {"x", "y"} <= {*state} and (home / "files/episode_00000/step_0000/rgb_image.png").is_file()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-import os
+from contextlib import closing
 from pathlib import Path
 
 from vla.config.build import require_no_paths
@@ -16,8 +16,8 @@ from vla.data.verification import find_episode, require_whole, verify_store
 from vla.io.errors import UserError, counted
 from vla.io.files import warn_on_error
 from vla.io.printable import show
+from vla.jobs.preview import recording
 from vla.reports.dataset_card import store_table, write_card
-from vla.rollouts.results import recording_name
 from vla.rollouts.rollout import replay
 
 log = logging.getLogger(__name__)
@@ -72,11 +72,11 @@ def _store_folder(options: Inspection) -> Path:
 def _replay_episode(experiment: Experiment, folder: Path, seed: int) -> None:
     """Replay the actions of a stored episode and compare the states.
 
-    With a recorder, write `episode-SEED.rrd`: the episode in the 3-D scene of the replay. A robot in the experiment
+    A recorder records it in the scene of the replay; Rerun's recording is `episode-SEED.rrd`. A robot in the experiment
     replaces that of the store's task, which may not name files. Raises a UserError if there is no such episode, it was
     imported, its store lacks the task, or the task now has another spec.
     """
-    store, output, robot = EpisodeStore(folder, allow_damage=True), experiment.output, experiment["task"].get("robot")
+    store, robot = EpisodeStore(folder, allow_damage=True), experiment["task"].get("robot")
     config, episode = find_episode(store, seed)
     if "recorded" in episode.draws:
         raise UserError(f"seed {seed} in {folder} was imported from a recording, so there is no world to replay it in")
@@ -87,19 +87,15 @@ def _replay_episode(experiment: Experiment, folder: Path, seed: int) -> None:
     require_no_paths(config, ("task",), folder, ["task.robot"] if robot else [])
     environment = make_environment(config["task"])
     store.spec.require(environment.spec, f"the episode store {folder}", "its task as it is built now")
-    recorder, file_name = None, ""
-    if experiment["recorder"] is not None:
-        from vla.rollouts.recorder import RerunRecorder  # imports the viewer's library
-
-        recorder, file_name = RerunRecorder(output, pictures=0), f"{recording_name(seed, episode.outcome)}.rrd"
-    with environment.blind():
+    with (
+        closing(environment),
+        recording(experiment, experiment.output / f"episode-{seed}.rrd") as (recorder, files),
+        environment.blind(),
+    ):
         step = replay(environment, episode, recorder).first_difference
-    environment.close()
     if step is None:
         log.info("the replay goes through the same states, bit for bit, and ends in %s", episode.outcome)
     else:
         log.warning("the replay differs from step %d on: a recording shows its scene, all else is from the store", step)
-    if file_name:
-        recording = output / f"episode-{seed}.rrd"
-        os.replace(output / file_name, recording)
-        log.info("wrote %s", recording)
+    if files:
+        log.info("wrote %s", " and ".join(map(str, files)))

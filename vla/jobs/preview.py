@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,6 +17,7 @@ from vla.reports.pictures import save
 from vla.rollouts.recordings import SUFFIXES
 from vla.rollouts.rollout import close_agent, rollout
 from vla.runs.folder import RECORDINGS
+from vla.spec import Recorder
 
 log = logging.getLogger(__name__)
 
@@ -23,29 +25,39 @@ log = logging.getLogger(__name__)
 def run(experiment: Experiment) -> None:
     """Roll out the expert on a few seeds; write contact sheet and, with a recorder, recording; print the draws."""
     output, options = experiment.output, experiment.options(Preview)
-    seeds, files = range(options.seed, options.seed + options.episodes), [output / "preview.png"]
+    seeds, picture = range(options.seed, options.seed + options.episodes), output / "preview.png"
     with (
-        writing(output / "preview.rrd"),
-        TemporaryDirectory(prefix=".recordings-", dir=output) as folder,
+        recording(experiment, output / "preview.rrd") as (recorder, recordings),
         closing(experiment.make_environment()()) as environment,
     ):
-        make_recorder = experiment.make_recorder(Path(folder))
-        expert, recorder = experiment.make_expert()(environment), make_recorder() if make_recorder else None
+        expert = experiment.make_expert()(environment)
         first_observations, draws = [], []  # of every episode; all of their images might not fit into memory
         for seed in seeds:
             episode = rollout(environment, expert, seed, recorder)
             first_observations.append(episode.observations[0])
             draws.append(episode.draws)
         close_agent(expert)
+    save(picture, reset_panels(list(seeds), first_observations), 2, (6.5, 2.2))
+    show(draws_table(list(seeds), draws))
+    log.info("wrote %s", " and ".join(map(str, [picture, *recordings])))
+
+
+@contextmanager
+def recording(experiment: Experiment, target: Path) -> Iterator[tuple[Recorder | None, list[Path]]]:
+    """Yield the recorder, if any, for a few episodes, and a list to which the files that it wrote are added at the end.
+
+    Rerun's recordings become one file, `target`; files of a package's recorder get a folder beside it.
+    """
+    files = list[Path]()
+    with writing(target), TemporaryDirectory(prefix=".recordings-", dir=target.parent) as folder:
+        make_recorder = experiment.make_recorder(Path(folder))
+        yield make_recorder() if make_recorder else None, files
         if recordings := sorted(Path(folder).glob("*.rrd")):
             from vla.rollouts.recorder import merge  # imports the viewer's library
 
-            merge(recordings, output / "preview.rrd")
-            files.append(output / "preview.rrd")
+            merge(recordings, target)
+            files.append(target)
         for file in sorted(Path(folder).iterdir()):
-            if file.suffix not in SUFFIXES:  # of a recorder of a package
-                (output / RECORDINGS).mkdir(exist_ok=True)
-                files.append(file.replace(output / RECORDINGS / file.name))
-    save(output / "preview.png", reset_panels(list(seeds), first_observations), 2, (6.5, 2.2))
-    show(draws_table(list(seeds), draws))
-    log.info("wrote %s", " and ".join(map(str, files)))
+            if file.suffix not in SUFFIXES:
+                (target.parent / RECORDINGS).mkdir(exist_ok=True)
+                files.append(file.replace(target.parent / RECORDINGS / file.name))
