@@ -273,8 +273,10 @@ def test_a_knob_at_zero_is_not_off_and_the_planner_turns_it_further() -> None:
         ("long 0", 20),  # the second tin in a basket, while a finger stands on the basket's wall
         ("long 1", 481),  # a flat box beside a carton
         ("long 7", 297),  # a tin in a basket, off which the hand must turn
+        ("long 7", 110),  # a basket whose wall the hand must clear before it leaves for the box
         ("long 8", 88),  # pots by their handles
         ("long 9", 41),  # a mug that slides out of a microwave if it is let go as soon as it counts as inside
+        ("long 9", 112),  # a mug whose best place in there changes on the way in, under the roof
     ],
 )
 def test_the_planner_solves(name: str, seed: int) -> None:

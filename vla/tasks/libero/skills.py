@@ -66,6 +66,11 @@ def approach(situation: Situation, grasp: Grasp, points: Array, thing: str, open
     obstacle_height = lowest(situation, obstacle_top + _funnel(-obstacle_room), obstacle_room)
     rise = max(0.0, thing_height - grasp.position[2], obstacle_height - grasp.position[2])
     target = grasp.position + rise * slope
+    # On the way the hand rises over what it would touch, such as the wall of the basket that it is in.
+    here = Grasp(situation.hand, situation.yaw, situation.lean)
+    way_room = max(room_of(situation, thing, here) - TOUCHING, ROOM - distance)
+    way_top = situation.surroundings(thing, situation.hand, HAND)[:, 2].max(initial=-np.inf) + TIP + MARGIN
+    target[2] = max(target[2], lowest(situation, way_top, way_room))
     return command(situation, rising_target(situation, target), grasp.yaw, opening, grasp.lean, grasp.swing)
 
 
@@ -92,7 +97,8 @@ def carry(situation: Situation, thing: str, place: Place) -> Array:
         offset = origin - place.spot
         depth = float(offset @ direction)  # that the thing still has to go in
         deviation = float(np.linalg.norm(offset - depth * direction))
-        if deviation > 0.02 or depth > np.linalg.norm(place.exit) + 0.03:
+        outside = depth - float(np.linalg.norm(place.exit))  # from the roof, under which it must not rise
+        if outside > 0.03 or (outside > -0.03 and deviation > 0.02):
             place = Place(place.spot + place.exit, place.turn, 0.0)
         elif depth > 0.004:
             return command(situation, situation.hand + place.spot - origin, yaw, 1.0, lean)
