@@ -98,7 +98,7 @@ def carry(situation: Situation, thing: str, place: Place) -> Array:
         depth = float(offset @ direction)  # that the thing still has to go in
         deviation = float(np.linalg.norm(offset - depth * direction))
         outside = depth - float(np.linalg.norm(place.exit))  # from the roof, under which it must not rise
-        if outside > 0.03 or (outside > -0.03 and deviation > 0.02):
+        if outside > 0.03 or deviation > (0.02 if outside > -0.03 else 0.05):
             place = Place(place.spot + place.exit, place.turn, 0.0)
         elif depth > 0.004:
             return command(situation, situation.hand + place.spot - origin, yaw, 1.0, lean)
