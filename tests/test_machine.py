@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -32,12 +33,15 @@ def test_bfloat16_on_a_processor_that_is_slow_at_it_is_one_warning(
     assert f"{part}.precision=bf16 is slow here" in message and f"in 32 bits, {part}.precision=fp32" in message
 
 
-def test_a_job_that_compiles_is_refused_without_a_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("CXX", "no-such-compiler")
+@pytest.mark.parametrize("compiler", ["no-such-compiler", "g++ '-O1"])
+def test_a_job_that_compiles_is_refused_without_a_compiler(
+    compiler: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("CXX", compiler)
     monkeypatch.chdir(tmp_path)
     for compiling in (("job=train", "learner.compile=true"), ("job=evaluate", "policy.compile=true")):
         key = compiling[1].removesuffix("=true")
-        message = rf"^{key} needs a C\+\+ compiler, and there is no no-such-compiler: .*, or set {key}=false$"
+        message = rf"^{key} needs a C\+\+ compiler, and there is no {re.escape(compiler)}: .*, or set {key}=false$"
         with pytest.raises(ValueError, match=message):
             jobs.run(Experiment.from_config(composed(*compiling, "trainer.accelerator=cpu", "policy.device=cpu")))
     assert not [*tmp_path.iterdir()]

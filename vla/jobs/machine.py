@@ -54,8 +54,17 @@ def require_compiler(config: Mapping[str, Any], groups: Container[str]) -> None:
     compilers = [os.environ["CXX"]] if "CXX" in os.environ else ["g++", "clang++"]
     for name in ("learner", "policy"):
         compiles = name in groups and (config[name] or {}).get("compile") is True
-        if compiles and not any(shutil.which(shlex.split(command)[0]) for command in compilers if command.strip()):
+        if compiles and not any(map(_is_installed, compilers)):
             raise UserError(
                 f"{name}.compile needs a C++ compiler, and there is no {' or '.join(compilers)}: install g++ and "
                 f"python3-dev, or set {name}.compile=false"
             )
+
+
+def _is_installed(command: str) -> bool:
+    """Return whether the program of a shell command exists; False for none, and for an unbalanced quotation mark."""
+    try:
+        words = shlex.split(command)
+    except ValueError:
+        return False
+    return bool(words) and shutil.which(words[0]) is not None
