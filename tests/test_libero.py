@@ -213,6 +213,9 @@ def test_a_scene_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     scene.load_scene(name, (), None)
     with full_disk(1000), pytest.raises(OSError, match="File too large"):
         scene.save_model(first, tmp_path / "half.mjb")
+    with monkeypatch.context() as changes:
+        changes.setenv("XDG_CACHE_HOME", "/proc/read-only")
+        assert np.array_equal(first.body_mass, scene.load_scene(name, (), None).body_mass)
     monkeypatch.setattr(scene, "_light", None)
     assert np.array_equal(first.body_mass, scene.load_scene(name, (), None).body_mass)
 

@@ -103,6 +103,20 @@ def test_pictures_of_forty_scenes_equal_mujocos(wide: tuple[Tabletop, Renderer, 
     assert np.max(differences) < 5  # at the edges of shadows
 
 
+@pytest.mark.parametrize("choice", [fast(), Reference()])
+def test_a_renderer_that_is_closed_leaves_the_others_as_they_are(choice: RendererFactory) -> None:
+    model, data = gallery("several")
+    views = Views((0,), SIZE, SIZE)
+    with closing(choice.open(model, views)) as one:
+        before = one.render(data)
+        other = choice.open(model, views)
+        other.render(data)
+        one.render(data)
+        other.close()
+        for now, earlier in zip(one.render(data), before, strict=True):
+            np.testing.assert_array_equal(now, earlier)
+
+
 def test_changes_of_a_model_are_taken_over(wide: tuple[Tabletop, Renderer, ReferenceRenderer]) -> None:
     """A renderer that has seen other episodes draws the same bytes as a new one."""
     environment, first, _ = wide
@@ -297,16 +311,19 @@ def test_a_machine_without_gl_is_told_from_others(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize(
     ("set_before", "device"),
-    [({}, "4"), ({gl.WORKER: "3"}, "1"), ({"MUJOCO_EGL_DEVICE_ID": "7"}, "7"), ({gl.EGL_DEVICES: ""}, None)],
+    [({}, "4"), ({gl.WORKER: "3"}, "1"), ({"MUJOCO_EGL_DEVICE_ID": "3"}, "3"), ({gl.EGL_DEVICES: ""}, None)],
 )
 def test_workers_take_turns_on_the_gpus_of_a_machine(
     set_before: dict[str, str], device: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("MUJOCO_EGL_DEVICE_ID", "GLCONTEXT_DEVICE_INDEX"):
+    for name in ("MUJOCO_EGL_DEVICE_ID", "GLCONTEXT_DEVICE_INDEX", gl.EGL_DEVICE, gl.WORKER):
         monkeypatch.setenv(name, "")  # so that what the code sets is undone, too
         monkeypatch.delenv(name)
-    for name, value in {gl.EGL_DEVICES: "1\n3\n4\n", gl.WORKER: "2", **set_before}.items():
+    worker = set_before.pop(gl.WORKER, "2")
+    for name, value in {gl.EGL_DEVICES: "1\n3\n4\n", **set_before}.items():
         monkeypatch.setenv(name, value)
+    gl.choose_device()  # as the main process does before it starts workers, which inherit its choice
+    monkeypatch.setenv(gl.WORKER, worker)
     gl.choose_device()
     assert os.environ.get("MUJOCO_EGL_DEVICE_ID") == os.environ.get("GLCONTEXT_DEVICE_INDEX") == device
 

@@ -17,6 +17,7 @@ NO_BACKEND = "disabled"
 PROBE = "import mujoco; mujoco.GLContext(8, 8).make_current()"
 EGL_WORKS = "VLA_EGL_WORKS"  # whether the fast renderer can run, found by a probe, inherited by child processes
 EGL_PROBE = "import moderngl; moderngl.create_standalone_context(backend='egl')"
+EGL_DEVICE = "VLA_EGL_DEVICE"  # number of the GPU that was assigned to this process, or to the one that started it
 EGL_DEVICES = "VLA_EGL_DEVICES"  # numbers of the GPUs that EGL can draw on, found by a probe, inherited likewise
 DEVICES_PROBE = """
 from mujoco.egl import egl_ext as egl
@@ -56,14 +57,14 @@ def choose_backend() -> None:
 def choose_device() -> None:
     """Assign the worker processes to the GPUs of this machine, round-robin, for both renderers.
 
-    A device that the user has set by MUJOCO_EGL_DEVICE_ID is kept.
+    A device that the user has set by MUJOCO_EGL_DEVICE_ID is kept; one that was assigned to the main process is not.
     """
-    device = os.environ.get("MUJOCO_EGL_DEVICE_ID")
-    if device is None and (devices := _egl_devices()):
+    device, inherited = os.environ.get("MUJOCO_EGL_DEVICE_ID"), os.environ.get(EGL_DEVICE)
+    if device in (None, inherited) and (devices := _egl_devices()):
         device = devices[int(os.environ.get(WORKER, "0")) % len(devices)]
-        os.environ["MUJOCO_EGL_DEVICE_ID"] = device
-    if device is not None:
-        os.environ.setdefault("GLCONTEXT_DEVICE_INDEX", device)  # of moderngl
+        os.environ["MUJOCO_EGL_DEVICE_ID"] = os.environ[EGL_DEVICE] = device
+    if device is not None and os.environ.get("GLCONTEXT_DEVICE_INDEX") in (None, inherited):
+        os.environ["GLCONTEXT_DEVICE_INDEX"] = device  # of moderngl
 
 
 def _egl_devices() -> list[str]:

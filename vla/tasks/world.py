@@ -13,6 +13,7 @@ import numpy as np
 from vla.io.errors import UserError
 from vla.parallel.limits import is_memory_scarce
 from vla.spec import Array
+from vla.tasks.gl import require_backend
 
 FREE = 0.25  # share of the memory that scenes leave free
 Scene = TypeVar("Scene")
@@ -54,7 +55,9 @@ class MultitaskWorld(World):
     tasks: tuple[str, ...]
 
     def __init__(self) -> None:
+        """Begin without scenes; a UserError on a machine that cannot render."""
         super().__init__()
+        require_backend()
         self._scenes: dict[str, Any] = {}
 
     def task_of(self, seed: int) -> str:

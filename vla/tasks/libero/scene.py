@@ -66,10 +66,11 @@ def load_scene(name: str, things: Collection[str], detail: Detail | None) -> muj
         model = _light(scene_xml(name), things, detail)
     except ValueError as error:
         raise UserError(f"MuJoCo {mujoco.__version__} cannot compile a scene of LIBERO: {error}") from error
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as draft:
-        save_model(model, draft)
-    return mujoco.MjModel.from_binary_path(str(path))
+    with suppress(OSError):  # without disk space, or in a read-only folder, the scene is not cached
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as draft:
+            save_model(model, draft)
+    return model
 
 
 def save_model(model: mujoco.MjModel, path: Path) -> None:

@@ -87,5 +87,6 @@ class ReferenceRenderer:
 
     def close(self) -> None:
         """Free the GL context; otherwise a traceback is printed when Python exits."""
+        self._gl.make_current()  # GL would free objects of the same numbers in another renderer's context
         self._context.free()
         self._gl.free()
