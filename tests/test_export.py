@@ -20,7 +20,8 @@ from PIL import Image
 from toy import ARM_SPEC
 
 from vla.data.episodes import EpisodeStore
-from vla.data.formats.files import Files, staging_folder
+from vla.data.formats.files import UNFINISHED, Files, staging_folder
+from vla.io.errors import UserError
 from vla.spec import Spec
 
 
@@ -68,7 +69,10 @@ def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
     assert (folder / "episode_00000/manifest.json").stat().st_mtime_ns == untouched
     with pytest.raises(ValueError, match=r"episode_00000 is not episode 0 of "):
         Files(folder).export(stored(tmp_path / "second", seeds=range(1, 2))[0])
-    with staging_folder(folder), pytest.raises(ValueError, match=r"another export to .*export is under way"):
+    with (
+        staging_folder(folder, folder / UNFINISHED),
+        pytest.raises(ValueError, match=r"another export to .*export is under way"),
+    ):
         Files(folder).export(store)
 
 
@@ -76,11 +80,18 @@ def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
 def test_what_a_killed_export_left_beside_the_whole_one_is_removed(kind: str, tmp_path: Path) -> None:
     store, _ = stored(tmp_path / "store")
     folder = exporter(kind, tmp_path / "export").export(store)
-    left, before = folder.with_name(".export.unfinished"), content(folder)
+    before = content(folder)
+    left = {"files": folder / UNFINISHED, "lerobot": folder.with_name(f".export{UNFINISHED}")}[kind]
     left.mkdir()
     (left / "lock").touch()
     exporter(kind, folder).export(store)
     assert not left.exists() and content(folder) == before
+
+
+def test_no_dataset_takes_the_place_of_a_mounted_disk(tmp_path: Path) -> None:
+    store, _ = stored(tmp_path / "store")
+    with pytest.raises(UserError, match=r"^/proc is where a disk is mounted: choose a new folder on it as export\.fol"):
+        exporter("lerobot", Path("/proc")).export(store)
 
 
 def written(folder: Path) -> int:

@@ -164,6 +164,7 @@ CHOICES: dict[str, tuple[dict[str, object], Callable[[Episode], bool]]] = {
     "a range": ({"seed": [1, 2]}, lambda episode: episode.seed in (1, 2)),
     "an open range": ({"point": [0.2, None]}, lambda episode: min(episode.draws["point"]) >= 0.2),
     "both": ({"seed": [None, 3], "limit": 40}, lambda episode: episode.seed <= 3),
+    "brackets": ({"label": "[a]"}, lambda episode: episode.seed == 1),
     "a draw that some lack": ({"lacks.which": "depth"}, lambda episode: episode.seed == 2),
 }
 
@@ -171,7 +172,8 @@ CHOICES: dict[str, tuple[dict[str, object], Callable[[Episode], bool]]] = {
 @pytest.mark.parametrize("name", CHOICES)
 def test_conditions_choose_episodes(tmp_path: Path, name: str) -> None:
     lacks: dict[int, Any] = {1: {"which": []}, 2: {"which": ["depth"]}}
-    episodes = [replace(one, draws={**one.draws, "lacks": lacks.get(one.seed, {})}) for one in MORE]
+    draws = [{"lacks": lacks.get(one.seed, {}), "label": "[a]" if one.seed == 1 else "a"} for one in MORE]
+    episodes = [replace(one, draws={**one.draws, **more}) for one, more in zip(MORE, draws, strict=True)]
     where, fits = CHOICES[name]
     derive_store([add(tmp_path / "store", episodes)], tmp_path / "chosen", where)
     store = EpisodeStore(tmp_path / "chosen")

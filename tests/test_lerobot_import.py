@@ -42,6 +42,7 @@ from toy import ARM, ARM_SPEC, make_arm
 from vla.config.experiment import make_agent
 from vla.data.datamodule import is_held_out
 from vla.data.episodes import EpisodeStore
+from vla.data.formats import lerobot_layout as layout
 from vla.data.formats import lerobot_tables as tables
 from vla.data.formats.lerobot_dataset import LeRobotDataset
 from vla.data.formats.lerobot_images import decode, encode, require_video
@@ -400,6 +401,27 @@ def test_components_of_other_names_are_taken_in_their_order_if_asked(home: Path)
         demonstrations(home / "dataset", spec)
     plain, renamed = demonstrations(home / "dataset", ARM_SPEC), demonstrations(home / "dataset", spec, in_order=True)
     np.testing.assert_array_equal(renamed.numbers(1)[2], plain.numbers(1)[2])
+
+
+def test_velocities_too_are_taken_in_their_order_if_asked(home: Path) -> None:
+    order = [*range(7), 14, *range(7, 14)]  # in the dataset: joints and fingers, then velocities
+    units = tuple(ARM_SPEC.state_units[index] for index in order)
+    spec = replace(ARM_SPEC, state=tuple("abcdefghijklmno"), state_units=units, robot=None)
+    keys = ["observation.state", layout.RATES]
+    with pytest.raises(UserError, match=r"that of the task 15 \(a, b, .*\): expert\.in_order=true takes them"):
+        demonstrations(home / "dataset", spec, state=keys)
+    renamed = demonstrations(home / "dataset", spec, state=keys, in_order=True)
+    plain = demonstrations(home / "dataset", ARM_SPEC)
+    np.testing.assert_array_equal(renamed.numbers(1)[1], plain.numbers(1)[1][:, order])
+
+
+def test_a_vector_of_one_component_is_written_as_lerobot_reads_it(tmp_path: Path) -> None:
+    columns = {"action": np.float32([[1], [2]]), "observation.state": np.float32([[1, 2], [3, 4]])}
+    tables.write_rows(tmp_path / "rows.parquet", [columns])
+    written = pq.read_table(tmp_path / "rows.parquet")
+    assert written.schema.field("action").type == pa.float32()
+    for name, values in columns.items():
+        np.testing.assert_array_equal(tables.vectors(written[name], values.shape[1]), values)
 
 
 def test_what_fits_the_task_nearly_is_taken_and_a_whole_picture_is_no_part_of_one(home: Path) -> None:

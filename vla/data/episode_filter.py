@@ -68,7 +68,8 @@ def _condition(name: str, criterion: Any) -> Callable[[Any], bool]:
     """Return the predicate of a scalar; a UserError if `criterion` is no condition."""
     texts = criterion if isinstance(criterion, list) else [criterion]
     if texts and all(isinstance(text, str) for text in texts):
-        return lambda value: isinstance(value, str) and any(fnmatchcase(value, text) for text in texts)
+        patterns = [text.replace("[", "[[]") for text in texts]  # else brackets are sets of characters
+        return lambda value: isinstance(value, str) and any(fnmatchcase(value, pattern) for pattern in patterns)
     if isinstance(criterion, (bool, int, float)):
         return lambda value: isinstance(value, bool) is isinstance(criterion, bool) and bool(value == criterion)
     if isinstance(criterion, list) and len(criterion) == 2 and all(end is None or _is_number(end) for end in criterion):

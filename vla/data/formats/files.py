@@ -24,6 +24,7 @@ from vla.io.printable import track
 from vla.io.types import Text
 from vla.parallel.pool import THIS_PROCESS, Cluster, WorkersLost
 
+UNFINISHED = ".unfinished"  # ending of the name of a folder for incomplete files
 MILLIMETRE = np.float32(0.001)  # [m]
 
 
@@ -45,8 +46,8 @@ class Files:
     def export(self, store: EpisodeStore, cluster: Cluster = THIS_PROCESS) -> Path:
         """Write the missing episodes, each atomically; returns the folder (UserError: the folder holds an episode of
         another store, or the store is damaged)."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        with staging_folder(self._folder) as staging:
+        # Within the folder, because that may be on a disk of its own.
+        with staging_folder(self._folder, self._folder / UNFINISHED) as staging:
             missing_numbers = [number for number in range(len(store.episodes)) if not self._is_exported(store, number)]
             deque(map_episodes(partial(self._export, staging), store, missing_numbers, cluster), 0)
         return self._folder
@@ -88,15 +89,15 @@ def provenance(entry: Entry) -> dict[str, Any]:
 
 
 @contextmanager
-def staging_folder(folder: Path) -> Iterator[Path]:
-    """Yield a hidden folder beside `folder` for incomplete files; it is removed on success and kept on failure.
+def staging_folder(folder: Path, staging: Path) -> Iterator[Path]:
+    """Make the folder `staging` for incomplete files of an export, and remove it on success; a failure keeps it.
 
     Raises:
         UserError: another process is exporting to `folder`.
         OSError: the export cannot be written; the message names `folder`.
     """
-    staging = folder.with_name(f".{folder.name}.unfinished")
-    staging.mkdir(parents=True, exist_ok=True)
+    with writing(folder):
+        staging.mkdir(parents=True, exist_ok=True)
     lock = try_lock(staging / "lock", f"another export to {folder} is under way: wait, or choose another export.folder")
     try:
         with writing(folder):

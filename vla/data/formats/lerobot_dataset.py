@@ -82,13 +82,13 @@ class LeRobotDataset:
         self.parts = self._read_parts([key for key in self.images.values() if self._is_video(key)])
 
     def components(
-        self, keys: Sequence[str], anonymous: Sequence[str] = (), in_order: bool = False
+        self, keys: Sequence[str], *anonymous: Sequence[str], in_order: bool = False
     ) -> dict[str, tuple[str, int]]:
         """Return component → its feature and index, of several features in order (UserError: there is no such feature,
         or it is no vector of a reasonable size).
 
-        If there are as many components as names in `anonymous`, these name unnamed components, or with `in_order` all.
-        Otherwise unnamed components are called by their feature and index.
+        The first names of `anonymous` that are as many as the components name unnamed components, or with `in_order`
+        all. Otherwise unnamed components are called by their feature and index.
         """
         features = self.info.features
         vectors = [key for key, feature in features.items() if len(feature.shape) == 1]
@@ -99,11 +99,12 @@ class LeRobotDataset:
                 raise UserError(f"{self.folder} has {size} components in {key}, the limit is {MAX_COMPONENTS}")
         places = [(key, index) for key in keys for index in range(features[key].shape[0])]
         numbered_names = [f"{key.rpartition('.')[2]}_{index}" for key, index in places]
-        if in_order and len(places) == len(anonymous):
-            return dict(zip(anonymous, places, strict=True))
+        given_names = next((names for names in anonymous if len(names) == len(places)), ())
+        if in_order and given_names:
+            return dict(zip(given_names, places, strict=True))
         if not any(features[key].components for key in keys):
-            by_number = len(places) != len(anonymous) or {*numbered_names} >= {*anonymous}
-            return dict(zip(numbered_names if by_number else anonymous, places, strict=True))
+            by_number = not given_names or {*numbered_names} >= {*given_names}
+            return dict(zip(numbered_names if by_number else given_names, places, strict=True))
         names_by_place = {(key, index): name for key in keys for index, name in enumerate(features[key].components)}
         names = [names_by_place.get(place, default) for place, default in zip(places, numbered_names, strict=True)]
         if len(set(names)) < len(names):

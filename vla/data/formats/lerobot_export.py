@@ -21,7 +21,7 @@ from annotated_types import Ge, Le
 
 from vla.data.episodes import EpisodeStore
 from vla.data.formats import lerobot_layout as layout
-from vla.data.formats.files import map_episodes, provenance, staging_folder
+from vla.data.formats.files import UNFINISHED, map_episodes, provenance, staging_folder
 from vla.data.formats.lerobot_images import encode
 from vla.data.formats.lerobot_tables import write_rows, write_tasks
 from vla.io.documents import read_json
@@ -63,7 +63,9 @@ class LeRobotExporter:
         store.require_episodes()
         episodes = [provenance(entry) for entry in store.episodes]
         source = {"spec": store.spec.to_dict(), "crf": self._crf, "episodes": episodes}
-        with staging_folder(self._folder) as staging:
+        if self._folder.is_mount():  # which no other folder can replace
+            raise UserError(f"{self._folder} is where a disk is mounted: choose a new folder on it as export.folder")
+        with staging_folder(self._folder, self._folder.with_name(f".{self._folder.name}{UNFINISHED}")) as staging:
             if _is_complete(self._folder, source):
                 return self._folder
             if self._folder.exists() and (not self._folder.is_dir() or any(self._folder.iterdir())):

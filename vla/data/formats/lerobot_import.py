@@ -70,8 +70,9 @@ class LeRobotDemonstrations(imported.ImportedDemonstrations):
         self._dataset = dataset = _open_dataset(folder, images)
         self._control_hz = (control_hz or dataset.info.fps) / every
         features = dataset.info.features
-        self._state = dataset.components(state, [spec.state[index] for index in spec.pose], in_order)
-        self._action = dataset.components(action, spec.action, in_order)
+        pose = [spec.state[index] for index in spec.pose]
+        self._state = dataset.components(state, pose, spec.state, in_order=in_order)
+        self._action = dataset.components(action, spec.action, in_order=in_order)
         rates = [layout.RATES] if layout.RATES in features and features[layout.RATES].components else []
         self._state |= {name: place for name, place in dataset.components(rates).items() if name not in self._state}
         executed = dataset.components([layout.EXECUTED]) if layout.EXECUTED in features else {}

@@ -166,14 +166,20 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
 def write_rows(path: Path, episodes: Sequence[Mapping[str, Array]]) -> None:
     """Write columns, each (N,) or (N, D), with a row group per episode.
 
-    The schema metadata has the types that the package `datasets` needs.
+    The schema metadata has the types that the package `datasets` needs. LeRobot reads a vector of one component as a
+    number.
     """
+    episodes = [{name: _without_unit_axis(values) for name, values in rows.items()} for rows in episodes]
     features = {name: _feature(values) for name, values in episodes[0].items()}
     metadata = {"huggingface": json.dumps({"info": {"features": features}})}
     tables = [pa.table({name: _arrow(values) for name, values in rows.items()}, metadata=metadata) for rows in episodes]
     with pq.ParquetWriter(path, tables[0].schema, compression="zstd", write_page_checksum=True) as writer:
         for table in tables:
             writer.write_table(table)
+
+
+def _without_unit_axis(values: Array) -> Array:
+    return values[:, 0] if values.shape[1:] == (1,) else values
 
 
 def _feature(values: Array) -> dict[str, Any]:
