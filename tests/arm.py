@@ -31,6 +31,7 @@ SPEC = Spec(
 
 ROBOT = JointLimits(
     joints=list(JOINTS),
+    grippers=[],
     low=JOINT_LOW.tolist(),
     high=JOINT_HIGH.tolist(),
     speed=[2.0] * 7,

@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 from arm import ARM, FORWARD, ROBOT, SAFETY, SPEC
+from defaults import defaults_of
 
 from vla.deploy.control_loop import REPETITION_TIME, ControlLoop
+from vla.deploy.joint_limiter import JointLimits
 from vla.deploy.motion import LEEWAY, Command
 from vla.deploy.observer import JointMeasurement
 from vla.deploy.safety import Safety, State
 from vla.robots.panda import HOME, JOINT_HIGH, forward
-from vla.spec import Observation
+from vla.spec import Observation, RobotModel
 
 IMAGE = np.zeros((8, 8, 3), np.uint8)
 
@@ -337,6 +339,29 @@ def test_an_arm_that_meets_an_obstacle_does_not_go_on_pushing(world: World) -> N
     world.run(3.0)
     assert world.loop.state is State.FAULT and "away from its command" in world.loop.reason
     np.testing.assert_array_equal(world.run(0.1)[-1].position, world.joints)
+
+
+def test_a_jaw_that_grasps_something_is_at_no_fault_and_keeps_its_grip_after_one() -> None:
+    limits = JointLimits(**defaults_of("deploy/robot/so101"))
+    names, units = tuple(limits.joints), ("rad",) * 6
+    spec = replace(
+        replace(SPEC, state=names, state_units=units, action=names, units=units, robot=RobotModel(names, "base")),
+        low=tuple(limits.low),
+        high=tuple(limits.high),
+    )
+    world, closed = World(), np.array([0.0, 0, 0, 0, 0, 0.1])
+    world.loop, world.joints = ControlLoop(spec, limits, replace(SAFETY, workspace=None), 50.0), closed.copy()
+    world.joints[5] = limits.low[5] - 0.002  # where an empty jaw may close to
+    world.begin()
+    world.answer, world.follows = lambda observation: np.float32([closed]), False
+    world.run(0.6)
+    world.joints[5] = 0.5  # of what it grasps
+    command = world.run(SAFETY.tracking_for + 1.0)[-1]
+    assert world.loop.state is State.RUNNING and command.position[5] == pytest.approx(0.1, abs=0.01)
+    world.joints[0] = 0.5  # somebody pushes the arm
+    command = world.run(SAFETY.tracking_for + 0.6)[-1]
+    assert world.loop.state is State.FAULT and command.position[0] == 0.5
+    assert command.position[5] == pytest.approx(0.1, abs=0.01)
 
 
 def test_an_arm_in_the_hands_of_a_person_is_not_commanded_and_goes_on_from_where_it_is_left(world: World) -> None:

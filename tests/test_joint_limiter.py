@@ -82,7 +82,9 @@ def test_without_overshoot_a_joint_at_its_goal_stays_there() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"low": [0.0]}, {"low": [1.0, -2.0]}, {"margin": 1.5}, {"joints": ["a", "a"]}], ids=str
+    "wrong",
+    [{"low": [0.0]}, {"low": [1.0, -2.0]}, {"margin": 1.5}, {"joints": ["a", "a"]}, {"grippers": ["c"]}],
+    ids=str,
 )
 def test_limits_that_no_arm_can_have_are_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match=r"deploy\.robot"):

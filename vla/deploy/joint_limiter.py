@@ -29,6 +29,7 @@ class JointLimits:
 
     Attributes:
         joints: J names, base to tip.
+        grippers: those among them that move fingers, which things between these keep away from their commands.
         low, high: position limits [rad].
         speed, acceleration: limits [rad/s], [rad/s²].
         fingers: names of the finger joints.
@@ -41,6 +42,7 @@ class JointLimits:
     """
 
     joints: Annotated[list[Text], MinLen(1)]
+    grippers: list[Text]
     low: list[float]
     high: list[float]
     speed: list[Positive]
@@ -62,6 +64,8 @@ class JointLimits:
             )
         if not unique([*self.joints, *self.fingers]):
             raise UserError("deploy.robot names a joint twice among its joints and fingers")
+        if unknown := [name for name in self.grippers if name not in self.joints]:
+            raise UserError(f"deploy.robot.grippers names {', '.join(unknown)}, which is not among its joints")
         if not len(self.fingers) == len(self.finger_open) == len(self.finger_closed) or (
             self.fingers and (self.widest is None or (self._finger_travel == 0).any())
         ):
@@ -87,6 +91,11 @@ class JointLimits:
                 )
         if model.gripper and not self.fingers:
             raise UserError(f"{owner} sees how far its gripper is open: name the joints in {key}.fingers")
+
+    @cached_property
+    def is_arm(self) -> Array:
+        """(J,) whether a joint moves the arm, not fingers."""
+        return np.array([name not in self.grippers for name in self.joints])
 
     @cached_property
     def min_position(self) -> Array:
@@ -141,8 +150,10 @@ class JointLimiter:
         self.velocity = np.zeros(len(limits.joints))
 
     def start(self, measured: Array) -> None:
-        """Start from the measured position (J,), at rest; raise a UserError if it is outside the limits."""
+        """Start from the measured position (J,), at rest; raise a UserError if the arm is outside its limits. A gripper
+        may be, because it closes until something stops it."""
         low, high = self.limits.min_position, self.limits.max_position
+        measured = np.where(self.limits.is_arm, measured, np.clip(measured, low, high))
         violations = (measured < low) | (measured > high)
         if violations.any():
             joint = int(np.argmax(violations))

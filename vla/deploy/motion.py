@@ -134,8 +134,9 @@ class Motion:
         self._record(now)
 
     def hold(self, measured: Array) -> None:
-        """Command the measured joints (J,), so that an arm that is elsewhere is not pulled back."""
-        self.limiter.hold(measured)
+        """Command the measured joints (J,), so that an arm that is elsewhere is not pulled back, but not those of a
+        gripper, because a grip would loosen."""
+        self.limiter.hold(np.where(self.limiter.limits.is_arm, measured, self.limiter.position))
         self._sent_trajectory, self._sent_valid = None, False
 
     def follow(self, plan: list[Waypoint], position: Array | None = None) -> None:

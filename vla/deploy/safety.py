@@ -34,7 +34,7 @@ class Safety:
     joints_age: Positive  # oldest joint state to act on [s]
     inference: Positive  # longest duration of an inference [s]
     instruction: Positive | None  # longest time to execute one instruction [s]; None: unlimited
-    tracking: Positive  # largest tracking error of a joint [rad] …
+    tracking: Positive  # largest tracking error of a joint of the arm [rad] …
     tracking_for: Positive  # … for so long [s]
     fresh_frames: Count  # consecutive matching sets of images after which a held arm moves again
     rejected: Count  # consecutive rejected plans that cause a fault
@@ -53,7 +53,8 @@ class Tracking:
 
     def check(self, motion: Motion, joint_state: JointMeasurement, now: float) -> tuple[bool, bool]:
         """Return whether the arm is off its commands for too long, and whether it moved while no joint state came."""
-        error = float(np.abs(motion.limiter.position - joint_state.joints).max())
+        errors = np.abs(motion.limiter.position - joint_state.joints)
+        error = float(errors.max(where=motion.limiter.limits.is_arm, initial=0.0))
         deviates = motion.started and self._follows_positions and error > self._safety.tracking
         was_lost, self._lost = self._lost, now - joint_state.stamp > self._safety.joints_age
         if self._lost or not deviates:
