@@ -80,6 +80,21 @@ def test_an_arm_that_is_guided_by_hand_moves_as_measured(tmp_path: Path) -> None
     assert (episode.actions[first : first + 8, 6] == 0).all()  # as measured, not as the policy last commanded
 
 
+def test_fingers_that_a_person_closes_around_something_are_labelled_closed_until_they_open(tmp_path: Path) -> None:
+    parts = (
+        bags.Part("running", bags.moving(6, 0), instruction="lift it"),
+        bags.Part("handed over", bags.moving(5, 1), person=True, commands=False),
+        bags.Part("handed over", bags.moving(5, 2, gripper=0.5), person=True, commands=False),
+        bags.Part("handed over", bags.moving(5, 3, gripper=0.8), person=True, commands=False),
+        bags.Part("handed over", bags.moving(5, 4), person=True, commands=False),
+        bags.Part("holding", bags.resting()),
+    )
+    episode = imported(bags.write(tmp_path / "bag", parts)).episode(1)
+    first = brightness(episode).index(7)
+    openings = episode.actions[first : first + 18, 6]
+    assert openings[3:].tolist() == pytest.approx([1, 0, 0, 0, 0, 0, 0.8, 0.8, 0.8, 0.8, 0.8, 1, 1, 1, 1])
+
+
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3], ids=["mcap", "sqlite3"])
 def test_a_session_without_a_policy_is_all_of_a_person(tmp_path: Path, storage: StoragePlugin) -> None:
     parts = [

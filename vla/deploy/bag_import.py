@@ -88,6 +88,8 @@ class _Bag:
         self.measured: Track = []  # joints (J,) [rad] and opening [m], together (J + 1,)
         self.commands: Track = []  # (J,) [rad]
         self.openings: Track = []  # commanded, 0 … 1
+        self._closing: list[bool] = []  # at every joint state, whether the fingers last closed, not opened
+        self._extreme = 0.0  # opening [m], the smallest since they last closed or the largest since they last opened
         self._assignments: list[_Assignment | None] = []  # at every joint state
         self._instruction, self._said_at, self._number = "", -np.inf, 0
         self._used, self._problems = set[str](), dict[str, str]()  # topics; topic → why its first message is unusable
@@ -170,8 +172,20 @@ class _Bag:
         stamp = max(stamp, self.measured[-1][0]) if self.measured else stamp
         self.inputs.append((arrival, joint_state._replace(stamp=stamp)))
         self.measured.append((stamp, np.append(joint_state.joints, joint_state.opening)))
+        self._follow_fingers(joint_state.opening)
         assignment = _Assignment(self._number, self._instruction, bool(self._person))
         self._assignments.append(assignment if self._instruction and self._person is not None else None)
+
+    def _follow_fingers(self, opening: float) -> None:
+        closing = bool(self._closing and self._closing[-1])
+        self._extreme = (min if closing else max)(self._extreme, opening)
+        if abs(opening - self._extreme) > REST_OPENING:
+            closing, self._extreme = not closing, opening
+        self._closing.append(closing)
+
+    def closing(self, time: float) -> bool:
+        """Return whether the fingers last closed, not opened, until `time`; then they may hold something."""
+        return self._closing[max(bisect_right(self.measured, time, key=ARRIVAL) - 1, 0)]
 
     def _instruct(self, arrival: float, message: Any) -> None:
         instruction = message.data.strip()
@@ -215,8 +229,9 @@ class BagDemonstrations(imported.ImportedDemonstrations):
     An episode is a period in which one instruction was followed, by the policy, or, from motion to rest, by a person to
     whom the arm was handed over; `recorded.person` in its draws tells which. Without the topic of the node's status a
     person always moves the arm. The action of a step is the motion that was commanded for one control period; where
-    none was, as when an arm is guided by hand, the measured one. Actions beyond the bounds of the task are clipped,
-    depth is 0. Whether an episode succeeded is not known: its outcome is "unverified".
+    none was, as when an arm is guided by hand, the measured one, but with closed fingers if these last closed: they may
+    hold something. Actions beyond the bounds of the task are clipped, depth is 0. Whether an episode succeeded is not
+    known: its outcome is "unverified".
 
     Args:
         folder: of a bag, or of a folder of bags.
@@ -338,7 +353,9 @@ class BagDemonstrations(imported.ImportedDemonstrations):
         openings = bag.openings[: bisect_right(bag.openings, end, key=ARRIVAL)][-1:]
         if openings and openings[0][0] >= segment.start:  # an earlier command was the policy's, not the person's
             return np.insert(motion, self._gripper, openings[0][1])
-        return np.insert(motion, self._gripper, self._limits.share(_interpolate(bag.measured, end)[joints]))
+        opening = self._limits.share(_interpolate(bag.measured, end)[joints])
+        # What is held keeps fingers apart, and at that opening a policy would not grip.
+        return np.insert(motion, self._gripper, 0.0 if bag.closing(end) else opening)
 
 
 def _covers(track: Track, time: float) -> bool:
