@@ -14,6 +14,7 @@ import threading
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,6 +28,7 @@ from composing import composed
 from documented import TEXT
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from warm import Started
@@ -77,11 +79,11 @@ class Probe:
 
     def __init__(self) -> None:
         RosNetwork("loopback", None, None).apply()
-        self._context = Context()
-        rclpy.init(context=self._context, domain_id=DOMAIN)
-        self.node = rclpy.create_node("probe", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=DOMAIN)
+        self.node = rclpy.create_node("probe", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
         self.states: list[JointState] = []
         self.commands: list[JointState] = []
         self.node.create_subscription(JointState, "/isaac/franka/joint_states", self.states.append, 10)
@@ -93,7 +95,7 @@ class Probe:
         deadline = time.monotonic() + seconds
         while not true():
             assert time.monotonic() < deadline
-            self._executor.spin_once(timeout_sec=0.02)
+            self.executor.spin_once(timeout_sec=0.02)
 
     def spin(self, seconds: float) -> None:
         """Spin for some seconds."""
@@ -119,9 +121,9 @@ class Probe:
 
     def close(self) -> None:
         """Destroy the node."""
-        self._executor.shutdown()
+        self.executor.shutdown()
         self.node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        rclpy.try_shutdown(context=self.context)
 
 
 @pytest.fixture
@@ -357,6 +359,20 @@ def test_an_interrupted_instruction_is_not_sent(start: Callable[..., Started], p
     probe.until(lambda: "vla_say" in probe.node.get_node_names())
     said.send_signal(signal.SIGINT)
     assert said.wait(5) == -signal.SIGINT  # and not after the ten seconds in which it waits for an agent
+
+
+def test_an_instruction_that_no_agent_obeys_is_an_error(start: Callable[..., Started], probe: Probe) -> None:
+    probe.node.create_subscription(String, "/user/command", lambda message: None, 1)  # as a recorder does
+    said = start("vla.deploy.say", "")
+    assert said.wait(30) == 1 and "waiting for /vla_agent to subscribe to /user/command" in said.printed()
+    agent = LifecycleNode("vla_agent", context=probe.context)
+    agent.create_subscription(String, "/user/command", lambda message: None, 1)
+    probe.executor.add_node(agent)
+    with ThreadPoolExecutor() as threads:
+        said = threads.submit(start("vla.deploy.say", "push the block").printed, 30)
+        probe.until(said.done)
+    assert "/vla_agent is unconfigured and ignores instructions: ros2 lifecycle set /vla_agent act" in said.result()
+    agent.destroy_node()
 
 
 def test_without_ros_the_error_says_what_to_install(home: Path, tmp_path: Path) -> None:

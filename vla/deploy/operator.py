@@ -13,8 +13,8 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.duration import Duration
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -87,19 +87,24 @@ class Operator:
             return answer.result()
 
     def say(self, instruction: str) -> None:
-        """Publish an instruction once all subscribers are discovered, and wait until they confirm it."""
-        found, since = 0, time.monotonic()
+        """Publish an instruction once the agent and all other subscribers are discovered, and wait until they confirm
+        it; a UserError if the agent is not active, because it then ignores instructions."""
+        topic, found, since = self._words.topic_name, 0, time.monotonic()
 
         def settled() -> bool:  # they are discovered one by one, in any order: the simulator may come before the agent
             nonlocal found, since
             if (count := self._words.get_subscription_count()) != found:
                 found, since = count, time.monotonic()
-            return found > 0 and time.monotonic() - since > SETTLING_TIME
+            names = [subscriber.node_name for subscriber in self.node.get_subscriptions_info_by_topic(topic)]
+            return AGENT.strip("/") in names and time.monotonic() - since > SETTLING_TIME
 
-        self.wait(settled, f"a subscriber on {self._words.topic_name}")
+        self.wait(settled, f"{AGENT} to subscribe to {topic}")
         self._words.publish(String(data=instruction))
         if not self._words.wait_for_all_acked(Duration(seconds=TIMEOUT)):
             raise UserError("a subscriber does not confirm the instruction: does one of the nodes hang?")
+        state = self.call(GetState, f"{AGENT}/get_state", GetState.Request()).current_state
+        if state.id != State.PRIMARY_STATE_ACTIVE:
+            raise UserError(f"{AGENT} is {state.label} and ignores instructions: ros2 lifecycle set {AGENT} activate")
 
     def describe(self) -> str:
         """Return the agent's status: its reason, then a line for each value."""
