@@ -353,7 +353,7 @@ def test_a_jaw_that_grasps_something_is_at_no_fault_and_keeps_its_grip_after_one
     world.loop, world.joints = ControlLoop(spec, limits, replace(SAFETY, workspace=None), 50.0), closed.copy()
     world.joints[5] = limits.low[5] - 0.002  # where an empty jaw may close to
     world.begin()
-    world.answer, world.follows = lambda observation: np.float32([closed]), False
+    world.answer, world.follows = lambda observation: closed[None].astype(np.float32), False
     world.run(0.6)
     world.joints[5] = 0.5  # of what it grasps
     command = world.run(SAFETY.tracking_for + 1.0)[-1]

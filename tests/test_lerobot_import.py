@@ -416,7 +416,7 @@ def test_velocities_too_are_taken_in_their_order_if_asked(home: Path) -> None:
 
 
 def test_a_vector_of_one_component_is_written_as_lerobot_reads_it(tmp_path: Path) -> None:
-    columns = {"action": np.float32([[1], [2]]), "observation.state": np.float32([[1, 2], [3, 4]])}
+    columns = {"action": np.array([[1], [2]], np.float32), "observation.state": np.array([[1, 2], [3, 4]], np.float32)}
     tables.write_rows(tmp_path / "rows.parquet", [columns])
     written = pq.read_table(tmp_path / "rows.parquet")
     assert written.schema.field("action").type == pa.float32()

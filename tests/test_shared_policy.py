@@ -6,6 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
+from errno import ENOSPC
 from functools import partial
 from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
@@ -18,13 +19,15 @@ import pytest
 from fake_batch import as_policy, make_act, make_bc, make_denoising, make_rt1
 from toy import SPEC, Telling, ToyEnvironment
 
+from vla.io.errors import UserError
 from vla.models.flow import Flow
 from vla.models.model import Model
 from vla.parallel.pool import Cluster
 from vla.rollouts.evaluate import evaluate
 from vla.rollouts.rollout import rollout
 from vla.rollouts.shared_policy import _accept, shared_policy
-from vla.spec import FIRST_SEED, Observation
+from vla.rollouts.supervised import SupervisedAgent
+from vla.spec import FIRST_SEED, Agent, Environment, Observation
 
 MODELS: dict[str, Callable[[], Model]] = {
     "bc": partial(make_bc, chunk=2),
@@ -96,6 +99,24 @@ def test_what_does_not_fit_is_said_and_no_memory_is_left_behind(monkeypatch: pyt
     for name in used:
         with pytest.raises(FileNotFoundError):
             SharedMemory(name)
+
+
+def test_a_failure_while_a_worker_begins_ends_the_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = as_policy(make_bc())
+
+    def no_space(*arguments: Any, **options: Any) -> Any:
+        raise OSError(ENOSPC, "No space left on device")
+
+    def on_new_expert(world: Environment) -> Agent:
+        raise UserError("no expert")
+
+    with pytest.raises(OSError, match="No space left"), shared_policy(lambda: policy) as make_agent:
+        evaluate(Telling, make_agent, no_space, SEEDS)
+    with pytest.raises(UserError, match="no expert"), shared_policy(lambda: policy) as make_agent:
+        evaluate(Telling, partial(SupervisedAgent, make_agent, on_new_expert), None, SEEDS)
+    monkeypatch.setattr("vla.rollouts.shared_policy.SharedMemory", no_space)
+    with pytest.raises(OSError, match="No space left"), shared_policy(lambda: policy) as make_agent:
+        evaluate(Telling, make_agent, None, SEEDS)
 
 
 def test_a_worker_is_answered_until_it_has_left_also_when_the_context_ends(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,7 +107,8 @@ class SimulatorNode(Node):
         silence = 0.0 if self._commanded_at is None else time.monotonic() - self._commanded_at
         if silence > self._command_timeout:
             self.get_logger().warning("no commands: the arm holds its pose", throttle_duration_sec=5.0)
-            self._target, self._commanded_at = self._hold_command(), None
+            # The gripper goes on closing: at its measured opening a grip would loosen.
+            self._target, self._commanded_at = (self._hold_command()[0], self._target[1]), None
         self._drivable.drive(*self._target, self._period)
         self._ticks += 1
         if self._running and self._ticks % self._ticks_per_step == 0:

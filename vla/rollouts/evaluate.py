@@ -10,6 +10,7 @@ import logging
 import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -236,18 +237,16 @@ class _RolloutWorker:
         make_recorder: RecorderFactory | None,
         lanes: int,
     ) -> None:
-        environment = make_environment()
-        self._agent = make_agent(environment)
-        further_lanes = range(1, lanes if isinstance(self._agent, Agents) else 1)
-        self._environments = [environment, *(make_environment() for _ in further_lanes)]
-        self._recorders = [_LenientRecorder(make_recorder()) for _ in self._environments] if make_recorder else None
+        with ExitStack() as stack:  # closes what there is if a part fails
+            self._environments = [stack.enter_context(closing(make_environment()))]
+            self._agent = make_agent(self._environments[0])
+            stack.callback(close_agent, self._agent)
+            for _ in range(1, lanes if isinstance(self._agent, Agents) else 1):
+                self._environments.append(stack.enter_context(closing(make_environment())))
+            self._recorders = [_LenientRecorder(make_recorder()) for _ in self._environments] if make_recorder else None
+            self.close = stack.pop_all().close
 
     def attempt(self, item: tuple[Sequence[int], bool]) -> list[Result]:
         """Play the episodes of seeds, and record them if the second part of the item says so."""
         seeds, recorded = item
         return play_episodes(self._environments, self._agent, seeds, self._recorders if recorded else None)
-
-    def close(self) -> None:
-        for environment in self._environments:
-            environment.close()
-        close_agent(self._agent)

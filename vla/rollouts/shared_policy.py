@@ -8,9 +8,11 @@ Shapes: k action chunk, D action components.
 
 from __future__ import annotations
 
+import logging
 import os
 import queue
 import secrets
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
@@ -27,6 +29,8 @@ import numpy as np
 from vla.io.errors import UserError, counted
 from vla.parallel.processes import make_picklable, one_thread_each
 from vla.spec import Agents, Array, Environment, Observation, RunningPlan, Spec
+
+log = logging.getLogger(__name__)
 
 MAX_WORKERS = 1024  # workers
 STATE = "a state"  # beside the cameras in shared memory, as an error calls it
@@ -83,12 +87,17 @@ def _accept(listener: Listener, begin: Callable[[int, Connection, Spec], Future[
     """Begin a talk with every worker that connects; it has a lane of its own until it leaves."""
     lanes = set[int]()
     while True:
-        with suppress(AuthenticationError, EOFError, OSError):  # of other programs that find the socket
+        try:
             connection = listener.accept()
             if (spec := connection.recv()) is None:
                 return
             lanes.add(lane := next(number for number in count() if number not in lanes))
             begin(lane, connection, spec).add_done_callback(lambda _, lane=lane: lanes.remove(lane))
+        except (AuthenticationError, EOFError, ConnectionError):  # of other programs that find the socket
+            continue
+        except OSError as error:
+            log.warning("a worker waits for the policy: %s", error)
+            time.sleep(1)  # until another one has left
 
 
 def _serve(policy: _Planner, requests: queue.Queue[Request | None]) -> None:
@@ -131,9 +140,12 @@ def _talk(
     policy: _Planner, requests: queue.Queue[Request | None], lane: int, connection: Connection, spec: Spec
 ) -> None:
     """Pass the requests of a worker, whose world has this spec, on to the policy until it leaves."""
-    memory = SharedMemory(create=True, size=_layout(spec).itemsize)
-    try:
-        with connection, suppress(EOFError, OSError):  # it has left, or was killed
+    with connection, suppress(EOFError, OSError):  # it has left, or was killed
+        try:
+            memory = SharedMemory(create=True, size=_layout(spec).itemsize)
+        except OSError as error:
+            return connection.send(make_picklable(error))
+        try:
             connection.send((memory.name, policy.spec, policy.execute, policy.history))
             while True:
                 kind, instruction, rest = connection.recv()
@@ -142,9 +154,9 @@ def _talk(
                 error = answer.exception()
                 reply = None if error else (answer.result(), policy.about(lane), policy.looking(lane))
                 connection.send(make_picklable(error) if error else reply)
-    finally:
-        memory.close()
-        memory.unlink()
+        finally:
+            memory.close()
+            memory.unlink()
 
 
 def _observation(
@@ -167,17 +179,16 @@ class _DistantPolicy:
 
     def __init__(self, address: str, key: bytes, environment: Environment) -> None:
         """Connect to a policy; raise a UserError if it has another spec than the environment."""
-        self._connection, self._world = Client(address, authkey=key), environment.spec.without_truth
-        self._connection.send(self._world)
-        name, self.spec, self.execute, self.history = self._connection.recv()
+        self._world = environment.spec.without_truth
         self.info: dict[str, Any] = {}
         self.looks = True
-        try:
+        with ExitStack() as stack:  # hangs up if something fails
+            self._connection = stack.enter_context(Client(address, authkey=key))
+            self._connection.send(self._world)
+            name, self.spec, self.execute, self.history = self._receive()
             self.spec.require_input(environment.spec, "the policy", "the task")
-        except ValueError:
-            self._connection.close()
-            raise
-        self._memory = SharedMemory(name)
+            self._memory = SharedMemory(name)
+            stack.pop_all()
 
     def reset(self, instruction: str, seed: int) -> None:
         self._ask("reset", instruction, seed)
@@ -204,11 +215,15 @@ class _DistantPolicy:
 
     def _ask(self, kind: str, instruction: str, rest: object) -> Any:
         self._connection.send((kind, instruction, rest))
-        answer = self._connection.recv()
-        if isinstance(answer, Exception):
-            raise answer
-        result, self.info, self.looks = answer
+        result, self.info, self.looks = self._receive()
         return result
+
+    def _receive(self) -> Any:
+        """Return the next message of the policy's process; raise it if it is an error."""
+        message = self._connection.recv()
+        if isinstance(message, Exception):
+            raise message
+        return message
 
     def close(self) -> None:
         self._memory.close()

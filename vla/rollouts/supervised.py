@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from typing import Any
 
 from vla.io.errors import UserError
@@ -14,8 +15,13 @@ class SupervisedAgent:
 
     def __init__(self, make_policy: AgentFactory, make_expert: AgentFactory, environment: Environment) -> None:
         """Let the expert of the environment, see `require_memoryless`, label what the policy sees."""
-        self._policy, self._expert = make_policy(environment), make_expert(environment)
-        require_memoryless(self._expert)
+        with ExitStack() as stack:  # closes the policy if the expert fails
+            self._policy = make_policy(environment)
+            stack.callback(close_agent, self._policy)
+            self._expert = make_expert(environment)
+            stack.callback(close_agent, self._expert)
+            require_memoryless(self._expert)
+            self.close = stack.pop_all().close
         self.info: dict[str, Any] = {}
 
     def reset(self, instruction: str, seed: int) -> None:
@@ -29,11 +35,6 @@ class SupervisedAgent:
         label = self._expert.act(observation)
         self.info = {**self._policy.info, "clean": self._expert.info.get("clean", label)}
         return action
-
-    def close(self) -> None:
-        """Close the policy and the expert."""
-        close_agent(self._policy)
-        close_agent(self._expert)
 
 
 def require_memoryless(expert: Agent) -> None:
