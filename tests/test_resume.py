@@ -15,6 +15,7 @@ from saved_policies import save_policy
 
 from vla.config.adopt import require_identity, resume
 from vla.config.experiment import to_plain
+from vla.models.policy_folder import read_policy
 from vla.reports.evaluation import write_report
 from vla.rollouts.results import Report, Result
 from vla.runs.resume import cached_success, newest_run, training_progress
@@ -70,6 +71,38 @@ def test_a_run_is_resumed_with_its_config_in_its_folder(tmp_path: Path) -> None:
         resume(now, tmp_path / "other", [])
     with pytest.raises(ValueError, match="experiment=few cannot be combined"):
         resume(now, tmp_path / "one", ["experiment=few"])
+
+
+def test_a_finished_training_of_an_encoder_in_a_relative_folder_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("encoder").mkdir()
+    config = to_plain(composed("job=train"))
+    config["model"]["text"] = {"_target_": "vla.models.text.huggingface.HuggingFace", "name": "encoder"}
+    leave(tmp_path / "one", config, finished=True, chosen=True)
+    assert read_policy(tmp_path / "one/policy").config["model"]["text"]["name"] == str(tmp_path / "encoder")
+    assert training_progress(tmp_path / "one", config) == (None, tmp_path / "one/policy")
+    (tmp_path / "one/checkpoints/last.ckpt").unlink()
+    assert training_progress(tmp_path / "one", config) == (None, tmp_path / "one/policy")
+    config["model"]["text"]["name"] = "another"
+    with pytest.raises(ValueError, match=r"holds a training that differs in model\.text\.name: choose"):
+        training_progress(tmp_path / "one", config)
+
+
+def test_rounds_that_were_moved_are_the_same(tmp_path: Path) -> None:
+    def of_rounds(root: Path) -> dict[str, Any]:
+        paths = {"pretrained": f"{root}/round_0/policy", "output": f"{root}/round_1"}
+        config = {**to_plain(composed("job=train")), **paths}
+        config["collect"]["more"] = ["/elsewhere", f"{root}/round_1/episodes"]
+        return config
+
+    leave(tmp_path / "moved/round_1", of_rounds(tmp_path / "first"), finished=True, chosen=True)
+    now = of_rounds(tmp_path / "moved")
+    assert training_progress(tmp_path / "moved/round_1", now) == (None, tmp_path / "moved/round_1/policy")
+    now["collect"]["more"][0] = "/other"
+    with pytest.raises(ValueError, match=r"holds a training that differs in collect\.more: choose"):
+        training_progress(tmp_path / "moved/round_1", now)
 
 
 def test_one_machine_is_one_whether_a_trainer_says_so_or_not(tmp_path: Path) -> None:

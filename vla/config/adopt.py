@@ -21,7 +21,7 @@ from vla.config.differences import ABSENT, differences, value_at
 from vla.io.documents import read_yaml, resolve_config
 from vla.io.errors import UserError
 from vla.models.checkpoint import read_header
-from vla.models.policy_folder import POLICY, REQUIRED_NODES, read_policy
+from vla.models.policy_folder import POLICY, REQUIRED_NODES, read_policy, with_absolute_paths
 from vla.models.trunk_folder import is_trunk
 
 log = logging.getLogger(__name__)
@@ -164,13 +164,18 @@ def require_identity(
 ) -> None:
     """Raise a UserError unless `config` describes the training in a run's `folder`, whose config is `saved_config`.
 
-    The dotted keys of `IDENTITY`, and `further_keys`, must have equal values.
+    The dotted keys of `IDENTITY`, and `further_keys`, must have equal values. Paths may be relative in one of them, and
+    those of other rounds may be where the folder was before it was moved with them.
     """
     defaults = {"trainer.num_nodes": 1}  # the default of trainers that omit it
     old, new = (
         {key: value_at(node, key, defaults.get(key)) for key in (*IDENTITY, *further_keys)}
-        for node in (saved_config, config)
+        for node in (_with_absolute_model(saved_config), _with_absolute_model(config))
     )
+    if isinstance(before := saved_config.get("output"), str):
+        for key in ("pretrained", "collect.more"):
+            if _moved(old[key], Path(before).parent, folder.parent) == new[key]:
+                old[key] = new[key]
     keys = [key for key, _, _ in differences(old, new)]
     if keys:
         weights = f"; pretrained={folder} starts another from its weights" if (folder / POLICY).exists() else ""
@@ -182,6 +187,21 @@ def require_identity(
             f"{folder} holds a training that differs in {', '.join(keys[:3])}{', …' if keys[3:] else ''}: "
             f"{'omit that to continue it' if config.get('resume') else way_out}{weights}"
         )
+
+
+def _with_absolute_model(config: Mapping[str, Any]) -> Mapping[str, Any]:
+    return (
+        {**config, "model": with_absolute_paths(config["model"])} if isinstance(config.get("model"), dict) else config
+    )
+
+
+def _moved(value: Any, before: Path, now: Path) -> Any:
+    """Return a path, or a list of paths, as they are after the folder `before` was moved to `now`."""
+    if isinstance(value, list):
+        return [_moved(item, before, now) for item in value]
+    if isinstance(value, str) and Path(value).is_relative_to(before):
+        return str(now / Path(value).relative_to(before))
+    return value
 
 
 def _parse(overrides: Sequence[str], fixed: Sequence[str]) -> list[Override]:

@@ -6,8 +6,10 @@ except those of trunks, under the names of the modules, and training.json how th
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -16,7 +18,7 @@ from typing import Any
 import torch
 from torch.overrides import TorchFunctionMode
 
-from vla.io.documents import SHA256, STRICT, lines_of, parse_json, parse_plain, read_resolved
+from vla.io.documents import SHA256, STRICT, lines_of, mappings, parse_json, parse_plain, read_resolved
 from vla.io.errors import UserError
 from vla.io.types import Natural, Seed
 from vla.models.hub import HUB, fetch
@@ -232,3 +234,14 @@ class TensorBudget(TorchFunctionMode):
             if self._remaining < 0:
                 raise UserError(f"{self._folder} describes a model that is larger than its weights")
         return func(*args, **kwargs)
+
+
+def with_absolute_paths(model: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the node of a model with absolute paths of weights, files or folders, valid in any working directory."""
+    model_copy = copy.deepcopy({**model})
+    encoders = ((node, "pretrained", Path.is_file) for node in mappings(model_copy))
+    parts = [(model_copy, "trunk", Path.is_dir), (model_copy.get("text"), "name", Path.is_dir), *encoders]
+    for node, key, is_there in parts:
+        if isinstance(node, dict) and isinstance(name := node.get(key), str) and is_there(Path(name)):
+            node[key] = str(Path(name).absolute())  # links are not resolved: the suffix of their name tells the format
+    return model_copy

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 import math
@@ -15,7 +14,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vla.io.documents import mappings
 from vla.io.files import atomic_path, write_json
 from vla.io.versions import installed_versions
 from vla.models import policy_folder as files
@@ -57,7 +55,7 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
     config, spec = content["config"], content["spec"]
     names = (*files.REQUIRED_NODES, *files.OPTIONAL_NODES, "seed", "pretrained")
     nodes = {name: config[name] for name in names if name in config}
-    nodes["model"] = _with_absolute_paths(nodes["model"])
+    nodes["model"] = files.with_absolute_paths(nodes["model"])
     validate = config.get("validate") or {}
     # The data module saves the digest of the demonstrations under a key with the name of its class, unknown here.
     states = [part for part in content.values() if isinstance(part, dict)]
@@ -93,17 +91,6 @@ def write_policy(folder: Path, content: Mapping[str, Any]) -> None:
         for path in draft.iterdir():
             with path.open("rb") as file:
                 os.fsync(file.fileno())
-
-
-def _with_absolute_paths(model: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the node of a model with absolute paths of weights, files or folders, valid in any working directory."""
-    model_copy = copy.deepcopy({**model})
-    encoders = ((node, "pretrained", Path.is_file) for node in mappings(model_copy))
-    parts = [(model_copy, "trunk", Path.is_dir), (model_copy.get("text"), "name", Path.is_dir), *encoders]
-    for node, key, is_there in parts:
-        if isinstance(node, dict) and isinstance(name := node.get(key), str) and is_there(Path(name)):
-            node[key] = str(Path(name).absolute())  # links are not resolved: the suffix of their name tells the format
-    return model_copy
 
 
 def _card(config: Mapping[str, Any], spec: Mapping[str, Any], training: files.Training, count: int) -> str:

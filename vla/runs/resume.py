@@ -49,7 +49,8 @@ def training_progress(folder: Path, config: Mapping[str, Any]) -> tuple[Path | N
     if changed and not longer and trainer["max_steps"] != header.steps:
         log.warning("%s was trained for %s, more than trainer.max_steps", folder, counted(header.steps, "step"))
     if header.finished and policy_folder.is_dir() and not longer:
-        require_identity(read_policy(policy_folder).config, config, folder)  # which is what other jobs build
+        saved_config = {**read_policy(policy_folder).config, "output": header.config.get("output")}
+        require_identity(saved_config, config, folder)  # other jobs build this one
         log.info("training is already finished: %s", policy_folder)
         return None, policy_folder
     if not last.exists():
