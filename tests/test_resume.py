@@ -93,7 +93,7 @@ def test_a_finished_training_of_an_encoder_in_a_relative_folder_is_finished(
 def test_rounds_that_were_moved_are_the_same(tmp_path: Path) -> None:
     def of_rounds(root: Path) -> dict[str, Any]:
         paths = {"pretrained": f"{root}/round_0/policy", "output": f"{root}/round_1"}
-        config = {**to_plain(composed("job=train")), **paths}
+        config: dict[str, Any] = {**to_plain(composed("job=train")), **paths}
         config["collect"]["more"] = ["/elsewhere", f"{root}/round_1/episodes"]
         return config
 

@@ -115,6 +115,20 @@ def test_resuming_at_a_validation_step_keeps_its_validation(
     assert logged(tmp_path / "half") == logged(tmp_path / "whole") != []
 
 
+def test_a_finished_training_that_goes_on_logs_at_the_steps_of_one_that_was_longer_from_the_start(
+    folder: Path, tmp_path: Path
+) -> None:
+    last, longer = tmp_path / "two/checkpoints/last.ckpt", 3 * VALIDATED
+    train(make_bc(), folder, tmp_path / "one", max_steps=longer)
+    train(make_bc(), folder, tmp_path / "two", max_steps=2 * VALIDATED)
+    train(make_bc(), folder, tmp_path / "two", checkpoint=last, max_steps=longer)
+    one, two = (
+        [(row["step"], *(name for name in row if row[name])) for row in logged(tmp_path / name)]
+        for name in ("one", "two")
+    )
+    assert one == two and len(one) > 6
+
+
 def test_a_policy_has_the_figures_of_a_validation_before_the_interruption(folder: Path, tmp_path: Path) -> None:
     half = train(make_bc(), folder, tmp_path, stop=VALIDATED + 1, max_steps=VALIDATED + 2)
     rest = train(make_bc(), folder, tmp_path, checkpoint=tmp_path / "checkpoints/last.ckpt", max_steps=VALIDATED + 2)

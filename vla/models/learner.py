@@ -170,6 +170,8 @@ class Learner(LightningModule):
         Raises:
             UserError: the loss of this step or an earlier one is not finite.
         """
+        # Lightning counts the last step of a finished training once more when that goes on, and labels curves with it.
+        self.trainer.fit_loop.epoch_loop._batches_that_stepped = self.global_step
         losses = self.model.loss(self.model.augment(batch))
         self._record_finite(losses["loss"].detach())
         interval = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
