@@ -131,6 +131,12 @@ def test_words_that_training_never_has_are_left_out() -> None:
     assert not torch.allclose(vector("block red"), vector("red block"))
 
 
+def test_without_training_all_words_are_read() -> None:
+    encoder = NGrams(width=8, **defaults_of("model/text/known_words")).eval()
+    red, blue = encoder(encoder.tokenize(["lift the red block", "lift the blue block"]))
+    assert not torch.equal(red, blue)
+
+
 def test_known_words_are_part_of_a_policy_and_take_names_of_colours_for_basic_terms_if_asked() -> None:
     encoder, other = make_known_words(["lift the red block"]), make_known_words(["push it"])
     tokens = encoder.tokenize(["lift the new block", "push it"])

@@ -113,13 +113,14 @@ class NGrams(TextEncoder):
         return self.norm(self.embedding(rows).sum(1) / count)
 
     def _drop_words(self, tokens: Tensor, rate: float) -> Tensor:
-        """Drop words from (B, W) tokens: in training at random, at `rate`, otherwise those unknown from training."""
+        """Drop words from (B, W) tokens: in training at random, at `rate`, otherwise those unknown from training; none if
+        the encoder was never trained, as when it is frozen."""
         rows = self._rows(tokens)
         if self.training:
             self.heard.index_fill_(0, rows.flatten(), True)  # in each process; those of the first one are saved
             mask = torch.rand(tokens.shape, device=tokens.device) < rate
         else:
-            mask = ~self.heard[rows]
+            mask = ~self.heard[rows] & self.heard.any()
         return padding_last(tokens.masked_fill(mask, PADDING), PADDING)
 
     def _rows(self, hashes: Tensor) -> Tensor:
