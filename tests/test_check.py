@@ -397,7 +397,10 @@ def test_a_factory_has_all_arguments_but_its_callers() -> None:
 
 def test_evaluation_seeds_used_for_training_or_selection_are_refused() -> None:
     assert problem(**{"evaluate.seed": 0}) == "evaluate.seed must be greater than or equal to 1000000, got 0"
-    assert "share episodes" in problem(**{"validate.seed": 1_000_004, "validate.episodes": 1})
+    shared = ("validate.seed=1000004", "validate.episodes=1")
+    with pytest.raises(ValueError, match="share episodes"):
+        check(composed(*shared))
+    check(composed("agent=expert", *shared))  # no weights are selected
 
 
 @pytest.mark.parametrize(

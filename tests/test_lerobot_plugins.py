@@ -66,6 +66,19 @@ def test_no_episode_of_lerobot_is_one_of_training() -> None:
     assert played[2] != played[3] and all(seed >= FIRST_SEED for seed in played)
 
 
+def test_without_seeds_other_episodes_follow_for_long() -> None:
+    world, played = LeRobotEnvironment("tabletop", 50, SMALL), list[int]()
+    shown = world.environment.reset(FIRST_SEED)
+    world.environment.reset = lambda seed: (played.append(seed), shown)[1]  # type: ignore[method-assign]
+    for seed in (1000, *[None] * 999):
+        world.reset(seed=seed)
+    first = played.copy()
+    world.reset(seed=1000)
+    world.reset()
+    world.close()
+    assert len({*first}) > 990 and played[1000:] == first[:2]
+
+
 def test_names_and_back_is_the_same_observation() -> None:
     random, spec = np.random.default_rng(0), ARM_SPEC
     given = [spec.random_observation(random) for _ in range(2)]

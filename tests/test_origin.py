@@ -51,6 +51,12 @@ def test_a_tree_is_dirty_if_its_code_is(tree: Path) -> None:
     assert find_origin().commits["mine"].endswith(" with uncommitted changes")
 
 
+def test_a_tree_of_which_git_says_nothing_in_time_is_perhaps_dirty(tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ask = origin._git
+    monkeypatch.setattr(origin, "_git", lambda *asked: None if "status" in asked else ask(*asked))
+    assert find_origin().commits["mine"].endswith(" perhaps with uncommitted changes")
+
+
 def test_trees_of_one_name_are_told_apart(tree: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     other = tmp_path / "other/mine"
     git(tmp_path, "clone", "-q", str(tree), str(other))

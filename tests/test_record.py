@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from rerun.chunk import RrdReader
 from toy_recordable import ThinkingAgent, make_environment
 
 from vla.rollouts import recorder
-from vla.rollouts.recorder import VIEWER, RerunRecorder, merge
+from vla.rollouts.recorder import TOKENS, VIEWER, RerunRecorder, _Writer, merge
 from vla.rollouts.results import recording_name
 from vla.rollouts.rollout import rollout
 from vla.spec import Episode, Shape
@@ -117,6 +118,15 @@ def test_colours_beyond_the_range_are_clipped() -> None:
     rgba = np.array([-0.2, 1.25, 0.5, 1])
     shape = Shape("table", "top", "box", np.zeros(3), np.array([1.0, 0, 0, 0]), np.ones(3), rgba)
     assert recorder._solid(shape).colors.as_arrow_array().to_pylist() == [0x00FF80FF]
+
+
+@pytest.mark.parametrize("components", [56, 60])
+def test_probabilities_of_many_components_have_a_row_each(components: int) -> None:
+    writer, shades = _Writer(Mock(), Mock(action=[*map(str, range(components))])), Mock()
+    writer._shades = shades  # type: ignore[method-assign]
+    writer.tokens(np.arange(2), np.full((2, components, 16), 1 / 16))
+    pixels = shades.call_args.args[2]
+    assert pixels.shape == (2, components, TOKENS[1]) and (pixels == 255).all()
 
 
 def test_recordings_leave_no_threads_behind(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from html import unescape
 from pathlib import Path
 from socket import create_connection, create_server
 from typing import Any
+from unittest.mock import Mock
 
 import mujoco
 import numpy as np
@@ -148,6 +149,12 @@ def test_a_policy_behind_a_server_acts_as_it_does_from_its_checkpoint(home: Path
     try:
         until(lambda: _listens(port))
         here(home, *SMALL, "agent=remote", f"agent.url=ws://127.0.0.1:{port}", "recorder=none", "output=remote")
+        asked = (*SMALL, "agent=remote", f"agent.url=ws://127.0.0.1:{port}", "recorder=none", "output=again")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("vla.jobs.evaluate.write_report", Mock(side_effect=KeyboardInterrupt))
+            here(home, *asked, ok=False)
+        done = here(home, *asked)
+        assert f"they are of what ws://127.0.0.1:{port} served then: if that is another" in done.stdout + done.stderr
         with connect(f"ws://127.0.0.1:{port}", proxy=None) as hostile:
             hostile.recv()
             hostile.send(pack({"\x1b]0;evil\x07\r\nerror: forged": 1}))

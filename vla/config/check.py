@@ -131,8 +131,8 @@ def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None
     """Check that values are compatible, and the task under every condition and with all other changes."""
     settings, validate, evaluate = experiment.settings, experiment.validate, experiment.evaluate
     one, other = validate.seeds, evaluate.seeds
-    # With a checkpoint, the seeds of its own training count.
-    if settings.checkpoint is None and range(max(one.start, other.start), min(one.stop, other.stop)):
+    trains = "learner" in groups and settings.checkpoint is None  # with a checkpoint, the seeds of its training count
+    if trains and range(max(one.start, other.start), min(one.stop, other.stop)):
         raise UserError(
             f"validate.seed={one.start} and evaluate.seed={other.start} share episodes, but episodes that select the "
             "weights must not evaluate them: change one of the two"
@@ -140,7 +140,7 @@ def _check_contents(experiment: Experiment, groups: Mapping[str, Group]) -> None
     conditions = {}
     if settings.job in ("evaluate", "improve"):
         conditions = {f"evaluate.conditions.{name}": changes for name, changes in evaluate.changes.items()}
-    if "learner" in groups and validate.episodes and settings.checkpoint is None:  # a checkpoint is not trained
+    if trains and validate.episodes:
         conditions["validate.changes"] = validate.changes
         # Episodes of a validation take the policy's lanes and precision, and need none of its libraries.
         _check_group(experiment.nodes.get("policy"), GROUPS["policy"], may_lack=True)

@@ -60,9 +60,10 @@ def _commits() -> dict[str, str]:
         if (output := _git(folder, "rev-parse", "--show-toplevel", "HEAD")) is not None:
             tree, commit = output.splitlines()
             # Files that git does not know can be chosen, too.
-            if _git(folder, "--no-optional-locks", "status", "--porcelain", "--", ".") or DIRTY in trees.get(tree, ""):
-                commit = f"{commit} {DIRTY}"
-            trees[tree] = commit
+            status = _git(folder, "--no-optional-locks", "status", "--porcelain", "--", ".")
+            if status != "":  # None: git took too long
+                trees[tree] = f"{commit} {'perhaps ' if status is None else ''}{DIRTY}"
+            trees.setdefault(tree, commit)
     names = [Path(tree).name for tree in trees]
     return {tree if names.count(name) > 1 else name: trees[tree] for tree, name in zip(trees, names, strict=True)}
 

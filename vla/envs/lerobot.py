@@ -52,8 +52,12 @@ class LeRobotEnvironment(Task):
 
         To seeds of training, such as LeRobot's default ones, `FIRST_SEED` is added.
         """
-        base_seed = int(self.np_random.integers(FIRST_SEED)) if seed is None else seed
-        return super().reset(seed=base_seed + FIRST_SEED * (base_seed < FIRST_SEED), options=options)
+        generator = self.np_random
+        base_seed = int(generator.integers(FIRST_SEED)) if seed is None else seed
+        result = super().reset(seed=base_seed + FIRST_SEED * (base_seed < FIRST_SEED), options=options)
+        if seed is None:  # else the next seed would follow from this one, and soon the same ones would come again
+            self.np_random = generator
+        return result
 
     def _arrays(self, observation: Observation) -> dict[str, Any]:
         values = super()._arrays(observation)

@@ -96,6 +96,8 @@ def evaluate_closed_loop(experiment: Experiment, checkpoint: Path | None) -> flo
     _ = experiment.origin, experiment.changes  # determine them now, before the code may change
     try:
         with PlayedEpisodes(output, identity) as played:
+            if checkpoint is None and any(played.results.values()) and (url := (experiment["agent"] or {}).get("url")):
+                log.warning("they are of what %s served then: if that is another policy now, choose output=DIR", url)
             with agents_for_workers(experiment, checkpoint) as make_agent:
                 reports = _play(experiment, make_agent, statements, played)
             if checkpoint and read_policy(checkpoint).training.weights != weights:  # workers read them as they start
@@ -120,14 +122,23 @@ def _identity(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]
     config = {name: node for name, node in experiment.config.items() if name not in (*IGNORED_KEYS, "evaluate")}
     weights = read_policy(checkpoint).training.weights if checkpoint else None
     is_recorded = experiment.evaluate.recordings == "all"  # as it is played
-    return {"weights": weights, "versions": installed_versions(), "config": config, "recorded": is_recorded}
+    identity = {"weights": weights, "versions": installed_versions(), "config": config, "recorded": is_recorded}
+    if checkpoint is None and (memory := _digest((experiment["agent"] or {}).get("folder"))):
+        identity["memory"] = memory
+    return identity
+
+
+def _digest(folder: str | None) -> str | None:
+    """Return the SHA-256 of the index of an episode store; None for any other folder."""
+    index = Path(folder or "") / INDEX
+    return hashlib.sha256(index.read_bytes()).hexdigest() if index.is_file() else None
 
 
 def _condition_identity(options: Evaluation, name: str) -> str:
     """Return what determines the results of a condition, apart from `_identity`."""
     detail = options.changes.get(name) or options.networks.get(name)
     if name == NEAREST:
-        detail = hashlib.sha256((Path(options.nearest or "") / INDEX).read_bytes()).hexdigest()
+        detail = _digest(options.nearest)
     return json.dumps([name, detail])
 
 

@@ -159,11 +159,13 @@ class _Writer:
     def tokens(self, steps: Array, probabilities: Array) -> None:
         """Write the probabilities (N, D, K) of steps (N,) as images: a row per component, scaled by its maximum."""
         components, bins = probabilities.shape[1:]
-        row, edges = TOKENS[0] // components, np.arange(TOKENS[1]) * bins // TOKENS[1]  # [px], bin of each column
+        row = max(TOKENS[0] // components, 1)  # height [px]
+        edges = np.arange(TOKENS[1]) * bins // TOKENS[1]  # bin of each column
         # The square root makes small probabilities visible.
         strength = np.maximum.reduceat(np.sqrt(probabilities / probabilities.max(axis=2, keepdims=True)), edges, axis=2)
         pixels = np.round(strength * 255).astype(np.uint8).repeat(row, axis=1)
-        pixels[:, ::row] = 0  # a line between rows
+        if row > 1:
+            pixels[:, ::row] = 0  # a line between rows
         self._shades("tokens", steps, pixels, "inferno", (0.0, 255.0))
         places = [(-11.0, (index + 0.5) * row) for index in range(components)]
         self._static("tokens/names", rr.Points2D(places, labels=self._spec.action, radii=0.0, show_labels=True))
