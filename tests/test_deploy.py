@@ -244,6 +244,12 @@ def test_a_loop_that_would_report_something_else_is_refused(override: str, sente
         job.run(loop_of(tmp_path, override))
 
 
+def test_a_loop_is_refused_where_there_is_a_bag_before_anything_starts(tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    with pytest.raises(UserError, match="bag exists already: choose another folder"):
+        job.run(loop_of(tmp_path))
+
+
 def test_a_loop_that_is_interrupted_before_an_episode_is_over_leaves_no_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

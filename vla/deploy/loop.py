@@ -12,7 +12,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from vla.deploy.record import BagRecorder
+from vla.deploy.record import BagRecorder, require_new
 from vla.deploy.ros import arguments as ros_arguments
 from vla.deploy.ros import plain_errors, ros
 from vla.deploy.ros2 import PolicyDeployment, SimulatorDeployment
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from vla.spec import Environment
 
 log = logging.getLogger(__name__)
+
+BAG = "bag"  # folder of the recorded messages, in that of the run
 
 
 @dataclass(kw_only=True)
@@ -88,6 +90,7 @@ class Loop:
                     f"deploy=loop: agent and simulator would not hear each other, because deploy.agent.{name} and "
                     f"deploy.simulator.{name} differ: change both alike"
                 )
+        require_new(self.output / BAG)
         context = get_context("spawn")
         processes = [
             context.Process(target=_run, args=(node, ros_arguments), daemon=True) for node in (agent, simulator)
@@ -105,7 +108,7 @@ class Loop:
             stack.callback(_end, processes)
             operator = DemoOperator(node, agent.topics.instruction, stop_event, *processes)
             # Recorded to the end, because a failed episode is the one to inspect.
-            stack.enter_context(closing(BagRecorder(node, self.output / "bag")))
+            stack.enter_context(closing(BagRecorder(node, self.output / BAG)))
             yield operator
 
 

@@ -24,6 +24,12 @@ MESSAGE_PACKAGES = ("sensor_msgs", "std_msgs", "trajectory_msgs", "geometry_msgs
 RESERVE = 256 << 20  # space on a disk that is left to finish a bag [bytes]
 
 
+def require_new(folder: Path) -> None:
+    """Raise a UserError if the folder of a bag exists already."""
+    if folder.exists():
+        raise UserError(f"{folder} exists already: choose another folder")
+
+
 class BagRecorder:
     """Writes the messages of every topic of a standard type to a bag until `close`, also of later topics."""
 
@@ -34,8 +40,7 @@ class BagRecorder:
             UserError: the folder exists, or rosbags is not installed.
         """
         bags = rosbags("rosbag2")
-        if folder.exists():
-            raise UserError(f"{folder} exists already: choose another folder")
+        require_new(folder)
         folder.parent.mkdir(parents=True, exist_ok=True)
         self._node, self._folder, self.messages = node, folder, 0
         self._writer = bags.Writer(folder, version=9, storage_plugin=bags.StoragePlugin.MCAP)

@@ -113,8 +113,8 @@ class NGrams(TextEncoder):
         return self.norm(self.embedding(rows).sum(1) / count)
 
     def _drop_words(self, tokens: Tensor, rate: float) -> Tensor:
-        """Drop words from (B, W) tokens: in training at random, at `rate`, otherwise those unknown from training. Without
-        any training, as of a frozen encoder, none is dropped."""
+        """Drop words from (B, W) tokens: in training at random, at `rate`, otherwise those unknown from training. None
+        is dropped without any training, as of a frozen encoder."""
         rows = self._rows(tokens)
         if self.training:
             self.heard.index_fill_(0, rows.flatten(), True)  # in each process; those of the first one are saved
