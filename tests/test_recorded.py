@@ -197,6 +197,11 @@ def test_outliers_do_not_widen_the_bounds_and_rare_events_do() -> None:
     low, high = action_bounds(moving)
     assert low == -1 and 1 < high < 3
     assert action_bounds(np.append(np.zeros(1000), 1.0)) == (0.0, 1.0)  # a gripper that closes once
+    noisy = np.random.default_rng(0).uniform(-0.001, 0.001, 10000)
+    noisy[::500] = 1.0  # one that closes every now and then
+    assert action_bounds(noisy)[1] == 1.0
+    noisy[::500], noisy[0] = 0.0, 1e6  # a glitch
+    assert action_bounds(noisy)[1] < 0.01
     low, high = action_bounds(np.full(10, 5.0))
     assert low < 5 < high
 

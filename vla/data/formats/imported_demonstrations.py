@@ -22,8 +22,9 @@ log = logging.getLogger(__name__)
 
 OUTLIER_QUANTILES = (0.01, 0.99)
 OUTLIER_MARGIN = 0.5  # by which bounds exceed the quantiles, as a fraction of the distance between these
-# Distance between the quantiles, as a fraction of the range, below which rare values are no outliers.
+# Distance between the quantiles, as a fraction of the range, below which other values are rare events, no outliers …
 RARE_EVENT_SPREAD = 0.02
+RARE_EVENTS = 1e-3  # … if they are at least this share of all
 BOUNDS_TOLERANCE = 1e-3  # of the bounds of actions, as a fraction of their range
 
 
@@ -133,12 +134,15 @@ def action_bounds(values: Array) -> tuple[float, float]:
     """Return bounds for a component of the actions, given its values (N,).
 
     They are the smallest and the largest value, unless one is an outlier: further from the quantiles than
-    `OUTLIER_MARGIN` times the distance between these. A component that hardly moves, such as a gripper, has none.
+    `OUTLIER_MARGIN` times the distance between these. In a component that hardly moves otherwise, such as a gripper,
+    only a share below `RARE_EVENTS` of its values can be outliers, and in one that does not move at all none.
     """
     lower, upper = float(values.min()), float(values.max())
     low, high = (float(quantile) for quantile in np.quantile(values, OUTLIER_QUANTILES))
-    if high - low > RARE_EVENT_SPREAD * (upper - lower):
-        lower, upper = max(lower, low - OUTLIER_MARGIN * (high - low)), min(upper, high + OUTLIER_MARGIN * (high - low))
+    margin = OUTLIER_MARGIN * (high - low)
+    outside = float(((values < low - margin) | (values > high + margin)).mean())
+    if high - low > RARE_EVENT_SPREAD * (upper - lower) or (high > low and outside < RARE_EVENTS):
+        lower, upper = max(lower, low - margin), min(upper, high + margin)
     margin = 1e-3 * max(1.0, abs(lower)) if lower == upper else 0.0
     return lower - margin, upper + margin
 
