@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from vla.data.formats.files import staging_folder
+from vla.io.errors import UserError
 from vla.io.files import atomic_path, remove_drafts, writing
+from vla.runs.resume import training_lock
 
 
 def test_a_file_and_a_folder_take_their_place_at_the_end(tmp_path: Path) -> None:
@@ -63,3 +66,14 @@ def test_what_killed_processes_left_is_removed_and_nothing_else(tmp_path: Path) 
     (tmp_path / ".0123abcd.run[1]").touch()
     remove_drafts(*(tmp_path / name for name in ("last.ckpt", "policy", "missing/policy", "run[1]")))
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)
+
+
+def test_where_files_in_use_cannot_be_removed_the_error_is_that_of_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On NFS a file that is removed while it is open stays in its folder under another name."""
+    monkeypatch.setattr(os, "unlink", lambda path, **_: os.rename(path, Path(path).with_name(".nfs1")))
+    with pytest.raises(UserError, match="too few windows"), training_lock(tmp_path / "run"):
+        raise UserError("too few windows")
+    with staging_folder(tmp_path / "export", tmp_path / "export/.unfinished") as staging:
+        assert staging.is_dir()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import pytest
 from composing import composed
@@ -44,6 +45,17 @@ def test_what_a_mapping_of_a_checkpoint_hides_is_not_resumed(attack: str, tmp_pa
     with pytest.raises(ValueError, match=r"last\.ckpt (cannot be read as a checkpoint|holds )"):
         read_header(run / "checkpoints/last.ckpt")
     assert not (tmp_path / "mark").exists()
+
+
+def test_a_checkpoint_whose_header_is_compressed_is_not_unpacked(tmp_path: Path) -> None:
+    whole = save_run(tmp_path / "run", to_plain(composed()), False) / "checkpoints/last.ckpt"
+    packed = tmp_path / "packed.ckpt"
+    with ZipFile(whole) as source, ZipFile(packed, "w", ZIP_DEFLATED) as target:
+        for entry in source.infolist():
+            target.writestr(entry.filename, source.read(entry), None if entry.filename.endswith(".pkl") else ZIP_STORED)
+    assert read_header(whole).config
+    with pytest.raises(ValueError, match=r"packed\.ckpt cannot be read as a checkpoint"):
+        read_header(packed)
 
 
 def test_the_policy_of_a_run_is_the_one_that_is_checked(tmp_path: Path) -> None:

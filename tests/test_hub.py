@@ -20,6 +20,7 @@ ENTRIES = [{"type": "file", "path": name, "size": len(content), "oid": name} for
 ANSWERS = {  # of as much of the hub as a download needs, with one model, `somebody/model`
     "/api/models/somebody/model/revision/main": json.dumps({"id": "somebody/model", "sha": COMMIT, "siblings": []}),
     f"/api/models/somebody/model/tree/{COMMIT}": json.dumps(ENTRIES),
+    "/api/models/somebody/portal/revision/main": "<html>Log in to use this network</html>",
     **{f"/somebody/model/resolve/{COMMIT}/{name}": content for name, content in FILES.items()},
 }
 
@@ -80,6 +81,12 @@ def test_a_model_that_the_hub_has_not_is_named(downloads: list[str]) -> None:
         fetch("nobody/model", "*")
     with pytest.raises(UserError, match=r"no/name/at/all cannot be fetched .*: models are called OWNER/NAME there"):
         fetch("no/name/at/all", "*")
+
+
+def test_what_answers_in_place_of_the_hub_is_an_error_of_one_line(downloads: list[str]) -> None:
+    with pytest.raises(UserError, match=r"somebody/portal cannot be fetched from the Hugging Face hub: .+") as caught:
+        fetch("somebody/portal", "*")
+    assert "\n" not in str(caught.value)
 
 
 def test_without_the_hub_the_reason_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
@@ -114,6 +115,14 @@ def test_a_failure_while_a_worker_begins_ends_the_evaluation(monkeypatch: pytest
         evaluate(Telling, make_agent, no_space, SEEDS)
     with pytest.raises(UserError, match="no expert"), shared_policy(lambda: policy) as make_agent:
         evaluate(Telling, partial(SupervisedAgent, make_agent, on_new_expert), None, SEEDS)
+    memory = [*Path("/dev/shm").iterdir()]
+    monkeypatch.setattr(os, "posix_fallocate", no_space)
+    with (
+        pytest.raises(UserError, match=r"no 0\.0 MB of shared mem"),
+        shared_policy(lambda: policy) as make_agent,
+    ):
+        evaluate(Telling, make_agent, None, SEEDS)
+    assert [*Path("/dev/shm").iterdir()] == memory
     monkeypatch.setattr("vla.rollouts.shared_policy.SharedMemory", no_space)
     with pytest.raises(OSError, match="No space left"), shared_policy(lambda: policy) as make_agent:
         evaluate(Telling, make_agent, None, SEEDS)

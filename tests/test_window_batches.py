@@ -72,7 +72,12 @@ def test_what_a_gpu_reads_is_page_locked_and_without_gaps(
         assert torch.equal(one, other) and one.is_contiguous() and one.data_ptr() in pinned
 
 
-def test_rows_in_random_order_are_those_of_the_file(tmp_path: Path) -> None:
+@pytest.mark.parametrize("advised", [True, False], ids=["Linux", "macOS"])
+def test_rows_in_random_order_are_those_of_the_file(
+    advised: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not advised:
+        monkeypatch.delattr(os, "posix_fadvise")
     values = np.random.default_rng(0).integers(0, 255, (900, 7, 5, 3), np.uint8)
     values.tofile(tmp_path / "rows.bin")
     damaged: Callable[[int], UserError] = lambda row: UserError(f"row {row}")  # noqa: E731

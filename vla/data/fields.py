@@ -42,7 +42,7 @@ class ScatteredRows:
         self._size, self._damage_error = field.size, damage_error
         self._file = field.files[0].open("rb", buffering=0)
         self._descriptor = self._file.fileno()
-        os.posix_fadvise(self._descriptor, 0, 0, os.POSIX_FADV_RANDOM)
+        self._advise("RANDOM", 0, 0)
         packed = self.codec != "raw"
         self._ends = np.asarray(np.memmap(field.files[1], END, mode="r", shape=(count,))) if packed else None
 
@@ -91,8 +91,12 @@ class ScatteredRows:
                 raise self._damage_error(int(rows[outliers[0]]))
             places = list(zip(starts.tolist(), sizes.tolist(), strict=True))
         for place in places:
-            os.posix_fadvise(self._descriptor, *place, os.POSIX_FADV_WILLNEED)
+            self._advise("WILLNEED", *place)
         return places
+
+    def _advise(self, use: str, start: int, size: int) -> None:
+        if hasattr(os, "posix_fadvise"):  # not on macOS
+            os.posix_fadvise(self._descriptor, start, size, getattr(os, f"POSIX_FADV_{use}"))
 
     def _read_packed(self, row: int, start: int, size: int) -> bytes:
         assert self._ends is not None, "raw rows are not compressed"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile, ZipFile
+from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 import torch
 
@@ -41,6 +41,9 @@ def read_content(path: Path, weights: bool = True) -> dict[str, Any]:
         raise UserError(f"there is no checkpoint {path}")
     try:
         with ZipFile(path) as archive:
+            # PyTorch compresses nothing, and what is compressed could be larger than the memory.
+            if any(entry.compress_type != ZIP_STORED for entry in archive.infolist()):
+                raise BadZipFile(f"{path} is compressed")
             if weights and (part := archive.testzip()):  # PyTorch ignores the checksums that it writes
                 raise BadZipFile(part)
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=not weights)

@@ -29,12 +29,12 @@ def fetch(name: str, *patterns: str, advice: str = "") -> Path:
     try:
         options = {"local_files_only": reason is not None}
         return Path(snapshot_download(repository, revision=revision or None, allow_patterns=list(patterns), **options))
-    except (HFValidationError, OSError) as error:
+    except Exception as error:  # of many types, also for what a proxy answers in place of the hub
         if isinstance(error, HFValidationError):
             reason = "models are called OWNER/NAME there"
         elif isinstance(error, RepositoryNotFoundError | RevisionNotFoundError):
             reason = f"it has no public model {repository}{f' at {revision}' if revision else ''}"
-        reason = reason or str(error).partition("\n")[0]
+        reason = reason or lines_of(error)[0]
         advice = advice and f"; {advice}"
         raise UserError(f"{name} cannot be fetched from the Hugging Face hub: {reason}{advice}") from error
 

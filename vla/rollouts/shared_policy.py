@@ -142,8 +142,8 @@ def _talk(
     """Pass the requests of a worker, whose world has this spec, on to the policy until it leaves."""
     with connection, suppress(EOFError, OSError):  # it has left, or was killed
         try:
-            memory = SharedMemory(create=True, size=_layout(spec).itemsize)
-        except OSError as error:
+            memory = _new_memory(_layout(spec).itemsize)
+        except (OSError, UserError) as error:
             return connection.send(make_picklable(error))
         try:
             connection.send((memory.name, policy.spec, policy.execute, policy.history))
@@ -157,6 +157,22 @@ def _talk(
         finally:
             memory.close()
             memory.unlink()
+
+
+def _new_memory(size: int) -> SharedMemory:
+    """Allocate shared memory; a UserError if there is too little, of which the first use would end this process."""
+    memory = SharedMemory(create=True, size=size)
+    try:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(memory._fd, 0, size)  # type: ignore[attr-defined]
+    except OSError as error:
+        memory.close()
+        memory.unlink()
+        raise UserError(
+            f"there are no {size / 1e6:.1f} MB of shared memory for another worker ({error.strerror}): lower "
+            "cluster.workers, set cluster.policy=beside, or start the container with a larger --shm-size"
+        ) from error
+    return memory
 
 
 def _observation(

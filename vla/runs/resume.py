@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -105,9 +104,13 @@ def training_lock(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if [path.name for path in folder.glob("*")] == [LOCK]:  # refused before any work
-            shutil.rmtree(folder)
+        refused = [path.name for path in folder.glob("*")] == [LOCK]  # before any work
+        if refused:
+            (folder / LOCK).unlink(missing_ok=True)  # while it is held: a later process creates a new one
         lock.release()
+        if refused:  # only now, because on NFS a file that is open stays under another name
+            with suppress(OSError):  # it is another process's by now
+                folder.rmdir()
 
 
 def first_process() -> bool:

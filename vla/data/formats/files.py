@@ -102,12 +102,14 @@ def staging_folder(folder: Path, staging: Path) -> Iterator[Path]:
     try:
         with writing(folder):
             yield staging
-        shutil.rmtree(staging)
+        for leftover in staging.iterdir():
+            shutil.rmtree(leftover, ignore_errors=True)
     finally:
-        with suppress(OSError):  # removes the folder only if it is empty
+        with suppress(OSError):
             (staging / "lock").unlink()
-            staging.rmdir()
         lock.release()
+        with suppress(OSError):  # it is not empty; on NFS it would not be while the lock is held
+            staging.rmdir()
 
 
 def map_episodes(
