@@ -93,6 +93,13 @@ def test_bounds_and_units_are_those_of_the_user_where_told() -> None:
     assert own.units == ("1",) * 3 and own.low[0] == -0.05
 
 
+def test_whole_numbers_are_the_nearest_ones() -> None:
+    world = make(id="toy/Whole-v0")
+    world.reset(0)
+    world.step(np.array([1.7, -1.7, 0.4]))
+    assert world._environment.unwrapped.taken.tolist() == [2, -2, 0]
+
+
 def test_state_entries_with_one_name_are_told_apart_by_their_paths() -> None:
     world = make(state={"observation.state": None, "info.truth.state": None}, id="toy/Twice-v0")
     assert world.spec.state == ("state_0", "state_1", "truth.state_0", "truth.state_1")
@@ -126,6 +133,10 @@ def test_state_entries_with_one_name_are_told_apart_by_their_paths() -> None:
         (
             {"options": {"seconds_per_stop": 0.1}},
             "toy/Toy-v0 cannot be made with task.options={'seconds_per_stop'",
+        ),
+        (
+            {"id": "toy/Whole-v0", "options": {"level": "wide"}},
+            "toy/Whole-v0 cannot be made with task.options={'level': 'wide'}: KeyError 'wide'",
         ),
         ({"images": {"eye": "observation.state"}}, "task.images.eye names no (H, W, 3) image of uint8, but float32"),
     ],

@@ -181,6 +181,16 @@ def test_another_block_is_asked_for_with_something_new_and_one_thing_only() -> N
     assert found == {"combinations", "phrasings", "words"}
 
 
+def test_another_block_that_training_names_has_no_held_out_colour() -> None:
+    swapped = make_tabletop("task/goal=mixed", "task/randomize=wide", "task/randomize/naming=swapped")
+    with swapped.blind():
+        for seed in range(60):
+            swapped.reset(seed)
+            (request,) = swapped.simulation.requests
+            colour = swapped.simulation.compiled.block_names[request.referents.blocks[0]]
+            assert request.held_out == "none" and colour not in request.goal.language.held_out_colours
+
+
 def test_held_out_colours_leave_one_to_name() -> None:
     all_but_one = "task.goal.language.held_out_colours=[green,blue,yellow]"
     environment = make_tabletop(all_but_one, "task.randomize.distractors.count=[1,1]")

@@ -47,6 +47,15 @@ def test_failures_are_told_apart() -> None:
     assert classifier.outcome == "not_placed" and classifier.milestones == {"grasped"}
 
 
+def test_a_block_that_is_put_down_on_a_tall_one_was_not_dropped() -> None:
+    for height, outcome in ((0.085, "not_placed"), (0.15, "dropped")):  # of its centre, above a top at 6 cm
+        classifier, pair = OutcomeClassifier(3), [Subgoal(0, np.zeros(3), "place", False)]
+        positions = np.array([[0.41, 0.0, height], [0.4, 0.0, 0.04]])
+        for held in (True, False):
+            classifier.update(state(positions, held=[held, False], tool=positions[0]), pair, named=[0, 1])
+        assert classifier.outcome == outcome
+
+
 def test_lifting_another_block_is_the_wrong_object() -> None:
     classifier = OutcomeClassifier(3)
     positions = np.array([[0.5, 0.0, 0.02], [0.4, 0.2, 0.12]])

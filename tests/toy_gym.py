@@ -57,6 +57,20 @@ class Unbounded(Toy):
         self.action_space = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float32)
 
 
+class Whole(Toy):
+    """The toy world, whose actions are whole numbers, and one of two levels."""
+
+    def __init__(self, render_mode: str | None = None, level: str = "easy") -> None:
+        super().__init__(render_mode)
+        self.level, self.taken = {"easy": 1, "hard": 2}[level], np.zeros(3, np.int64)
+        self.action_space = gymnasium.spaces.Box(-2, 2, (3,), np.int64)
+
+    def step(self, action: np.ndarray) -> Any:
+        self.taken = action
+        return super().step(np.float32(action))
+
+
+gymnasium.register("toy/Whole-v0", "toy_gym:Whole", max_episode_steps=500)
 gymnasium.register("toy/Twice-v0", "toy_gym:Twice", max_episode_steps=500)
 gymnasium.register("toy/Tensors-v0", "toy_gym:Tensors", max_episode_steps=500)
 gymnasium.register("toy/Unbounded-v0", "toy_gym:Unbounded", max_episode_steps=500)

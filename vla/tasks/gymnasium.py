@@ -122,7 +122,8 @@ class Gymnasium(World):
     def step(self, action: Array) -> Observation:
         """Apply one (D,) action, clipped to the bounds."""
         self._require_running()
-        command = np.clip(action, self.spec.low, self.spec.high).astype(self._environment.action_space.dtype)
+        command, dtype = np.clip(action, self.spec.low, self.spec.high), self._environment.action_space.dtype
+        command = (np.rint(command) if np.issubdtype(dtype, np.integer) else command).astype(dtype)
         observation, _, terminated, truncated, info = self._environment.step(command)
         values = self._values(observation, info)
         success = _get(values, self._success, None)
@@ -178,8 +179,9 @@ def _make(package: str, id: str, options: Mapping[str, object], steps: int | Non
         options = {**options, "render_mode": "rgb_array"}
     try:
         return gymnasium.make(spec, max_episode_steps=steps, disable_env_checker=True, **options)
-    except (TypeError, ValueError, Error) as error:
-        raise UserError(f"{id} cannot be made with task.options={dict(options)}: {error}") from error
+    except Exception as error:  # of any kind: it comes from a constructor of others
+        kind = "" if isinstance(error, TypeError | ValueError | Error) else f"{type(error).__name__} "
+        raise UserError(f"{id} cannot be made with task.options={dict(options)}: {kind}{error}") from error
 
 
 def _bound(name: str, setting: Numbers | float | None, defaults: Array) -> tuple[float, ...]:

@@ -98,7 +98,8 @@ class CompiledScene:
         for pad in range(len(PADS)):
             self.place_pad(pad, 0.4, 0.15 * pad)
         for index in range(count):
-            self.place_block(index, 0.52, 0.12 * (index - (self.present - 1) / 2), 0.0)
+            column = index - (self.present - 1) / 2 if index < 5 else 3 - index  # a sixth would be out of reach
+            self.place_block(index, 0.52, 0.12 * column, 0.0)
         self.place_arm(self.robot.kinematics.home, self.robot.widest)
 
     def paint_blocks(self, names: Sequence[str], rgb: Array) -> None:

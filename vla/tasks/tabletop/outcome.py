@@ -11,7 +11,7 @@ from vla.tasks.tabletop.goals.goal import Skill, Subgoal, WorldState, current_su
 REACH = 0.035  # distance between tool point and block centre at which a block is reached [m]
 PUSH = 0.07  # the same for a block to be pushed from its side [m]
 CLEAR = 0.02  # height above the table at which a held block is lifted [m]
-FALL = 0.05  # height above the table from which losing a block is a drop [m]
+FALL = 0.05  # height above the table, or a block below, from which losing a block is a drop [m]
 # Outcomes of episodes in which the named block was grasped, or reached if it is to be pushed.
 GRASPED = ("success", "dropped", "not_placed", "timeout")
 
@@ -51,7 +51,7 @@ class OutcomeClassifier:
         if lifted[block]:
             self._lifted = self._holding = True
             self._dropped = False
-            self._height = state.positions[block, 2] - state.extents[block, 2]
+            self._height = _height(state, block)
         elif self._holding and not state.touched[block]:
             self._holding, self._dropped = False, self._height > FALL
 
@@ -82,3 +82,11 @@ class OutcomeClassifier:
         if self._skill in (None, "stay") or self.outcome not in GRASPED:
             return frozenset()
         return frozenset({"reached" if self._skill == "push" else "grasped"})
+
+
+def _height(state: WorldState, block: int) -> float:
+    """Return the height of a block above the table, or above another block that it overlaps from above [m]."""
+    bottom, tops = state.positions[block, 2] - state.extents[block, 2], state.positions[:, 2] + state.extents[:, 2]
+    apart = np.abs(state.positions[:, :2] - state.positions[block, :2]).max(axis=1)
+    below = (apart < state.extents[:, :2].max(axis=1)) & (tops < state.positions[block, 2])
+    return float(bottom - tops[below].max(initial=0.0))

@@ -102,7 +102,7 @@ class Simulation:
         """Draw an instruction and, unless given, what it names; `stream` is added to the names of random streams."""
         held_out = self._draw_held_out(goal, self.streams(seed, f"novelty{stream}"), seed)
         if referents is None:
-            referents = self._choose(goal, held_out, self.streams(seed, "named"))
+            referents = self._choose(goal, held_out, self.streams(seed, "named"), seed)
             if self.compiled.skip and not goal.absent:  # another block may change whether its colour is held out
                 held_out = self._adapt_held_out(goal, referents, held_out)
         words = self._slots(goal, referents, seed)
@@ -152,7 +152,9 @@ class Simulation:
             return kind
         return "combinations" if novel else next((k for k in goal.language.held_out_kinds if k != "combinations"), None)
 
-    def _choose(self, goal: Goal, held_out: HeldOutKind | None, random_state: np.random.RandomState) -> Referents:
+    def _choose(
+        self, goal: Goal, held_out: HeldOutKind | None, random_state: np.random.RandomState, seed: int
+    ) -> Referents:
         """Draw the named blocks and pads; the first block has a colour that the instruction may name."""
         colours, names = goal.language.held_out_colours, self.compiled.block_names
         order = [int(index) for index in random_state.permutation(self.compiled.present)]
@@ -163,8 +165,10 @@ class Simulation:
                 "task.goal.language.held_out_colours: all blocks of a scene have such a colour, so none can be named: "
                 "hold out fewer, or raise task.randomize.distractors.count"
             )
-        skip = self.compiled.skip % len(order)
-        order = order[skip:] + order[:skip]
+        # In training only among those that may be named.
+        count = len(order) if seed >= FIRST_SEED else sum(names[index] not in colours for index in order)
+        skip = self.compiled.skip % count
+        order = [*order[skip:count], *order[:skip], *order[count:]]
         return Referents(tuple(order[: goal.named]), tuple(random_state.permutation(goal.pads).tolist()))
 
     def _slots(self, goal: Goal, referents: Referents, seed: int) -> dict[str, str]:
