@@ -19,7 +19,9 @@ from vla.config.experiment import Experiment
 from vla.jobs.evaluate import require_possible
 from vla.parallel.pool import Cluster, WorkerCrash
 from vla.reports.evaluation import summary, write_report
+from vla.reports.run_page import write_page
 from vla.rollouts import recordings
+from vla.rollouts.comparison import compare_conditions
 from vla.rollouts.evaluate import _RolloutWorker, evaluate
 from vla.rollouts.recordings import choose_results, keep_pictures, merge_recordings
 from vla.rollouts.results import Report, Result
@@ -141,6 +143,18 @@ def test_a_condition_of_a_benchmark_keeps_its_interval_on_the_page(tmp_path: Pat
     written = read_report(tmp_path)
     assert written and written.reports["dark"].interval == written.reports["seen"].interval == report.interval
     assert written.reports["seen"].mean_label == report.mean_label == "mean over tiers (2 of 3 tasks)"
+
+
+def test_a_condition_that_changes_nothing_is_the_training_condition_on_the_page_too(tmp_path: Path) -> None:
+    report = Report(of_ten(reach=10, stack=2))
+    evaluate = {"conditions": {"dark": {"light": 0}, "same": {"light": 1}}}
+    config = {"task": {"light": 1}, "evaluate": evaluate}
+    conditions = {"dark": report, "same": report}
+    write_report(report, tmp_path / "report.json", None, config, {}, conditions, compare_conditions(conditions, 0.02))
+    written = read_report(tmp_path)
+    assert written and written.reports["same"] is written.reports["seen"] is not written.reports["dark"]
+    page = write_page(tmp_path).read_text()
+    assert "the same as seen, because they change nothing in the task: same" in page
 
 
 def test_milestones_have_a_rate_of_their_own() -> None:

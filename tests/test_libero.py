@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from composing import composed
 from replaying import played, same
+from saved_policies import save_policy
 from toy_episodes import full_disk
 
-from vla.config.experiment import Experiment
+from vla.config.experiment import Experiment, to_plain
 from vla.io.errors import UserError
 from vla.jobs.evaluate import require_possible
 from vla.rollouts.rollout import rollout
@@ -188,7 +189,7 @@ def test_all_suites_have_ten_tasks_and_sentences() -> None:
     assert world("[all,goal]").tasks == world().tasks
 
 
-def test_no_official_state_counts_twice() -> None:
+def test_no_official_state_counts_twice(tmp_path: Path) -> None:
     def of_goal(*overrides: str) -> Experiment:
         return Experiment.from_config(composed("experiment=libero", *PLAIN, "task.suite=goal", *overrides))
 
@@ -199,6 +200,9 @@ def test_no_official_state_counts_twice() -> None:
     for seed in (1_000_500, 1_500_000):
         with pytest.raises(UserError, match=rf"validate\.seed={seed} and .* share initial states, .*seed=2000000$"):
             require_possible(of_goal("evaluate.episodes=500", f"validate.seed={seed}"))
+    save_policy(tmp_path, to_plain(composed("experiment=libero", *PLAIN, "task.suite=goal", "validate.seed=1500000")))
+    with pytest.raises(UserError, match=r"validate\.seed=1500000 and evaluate\.seed=1000000 share initial states"):
+        require_possible(of_goal("evaluate.episodes=500", f"checkpoint={tmp_path}"))
     with pytest.raises(UserError, match="there are 50 different ones in the condition one, "):
         require_possible(of_goal("evaluate.episodes=500", "+evaluate.conditions.one={tasks: [0]}"))
 

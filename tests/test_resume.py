@@ -18,7 +18,8 @@ from vla.config.experiment import to_plain
 from vla.models.policy_folder import read_policy
 from vla.reports.evaluation import write_report
 from vla.rollouts.results import Report, Result
-from vla.runs.resume import cached_success, newest_run, training_progress
+from vla.runs.folder import read_report
+from vla.runs.resume import cached_report, newest_run, training_progress
 
 OF_TRAINER = ("trainer.max_steps=9", "trainer.precision=bf16")
 
@@ -162,8 +163,8 @@ def test_a_report_of_older_weights_or_compared_with_an_older_run_is_not_this_one
         for file in (other, replayed):
             file.touch()
         write_report(report, tmp_path / "report.json", str(policy), asked, {"weights": "1"})
-        assert cached_success(tmp_path, asked, policy, "1") == 0.5
-        assert cached_success(tmp_path, to_plain(composed("evaluate.episodes=9")), policy, "1") is None
-        assert cached_success(tmp_path, asked, policy, "2") is None  # copied here with its date
+        assert cached_report(tmp_path, asked, policy, "1") == read_report(tmp_path)
+        assert cached_report(tmp_path, to_plain(composed("evaluate.episodes=9")), policy, "1") is None
+        assert cached_report(tmp_path, asked, policy, "2") is None  # copied here with its date
         os.utime(changed, (time.time() + 10, time.time() + 10))
-        assert cached_success(tmp_path, asked, policy, "1") is None
+        assert cached_report(tmp_path, asked, policy, "1") is None

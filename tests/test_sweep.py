@@ -225,6 +225,14 @@ def test_single_trainings_are_compared_in_the_course_of_episodes(tmp_path: Path)
     assert "Differences in secondary metrics" in page and "-100.0 * (" in page
 
 
+def test_rows_of_the_same_scenes_in_other_pictures_are_compared_under_conditions_too(tmp_path: Path) -> None:
+    for number, size in enumerate((96, 48)):
+        config = {"task": {"image_size": [size, size]}, "evaluate": {"conditions": {"dark": {"light": 0}}}}
+        drawn = [f"task.image_size=[{size},{size}]"]
+        cell(tmp_path, number, drawn, 5, config=config, draws=lambda n: {"blocks": n})
+    assert [condition for _, _, condition in compare_rows(tabulate(tmp_path))] == ["seen", "dark"]
+
+
 def test_several_trainings_count_as_fewer_episodes_in_a_comparison(tmp_path: Path) -> None:
     for number, (model, successes) in enumerate([("bc", 9), ("bc", 9), ("rt1", 1), ("rt1", 9)]):
         cell(tmp_path, number, [f"model={model}", f"seed={number % 2}"], successes)

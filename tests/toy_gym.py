@@ -67,7 +67,7 @@ class Whole(Toy):
 
     def step(self, action: np.ndarray) -> Any:
         self.taken = action
-        return super().step(np.float32(action))
+        return super().step(action.astype(np.float32))
 
 
 gymnasium.register("toy/Whole-v0", "toy_gym:Whole", max_episode_steps=500)

@@ -44,7 +44,7 @@ from vla.rollouts.statements import BarStatement, RunStatement, Statement, diffe
 from vla.runs.files import readable_config
 from vla.runs.folder import PLOT, RECORDING, RECORDINGS, REPORT, SUITE, describe_files, require_run, save_config
 from vla.runs.played import PlayedEpisodes
-from vla.runs.resume import cached_success, has_rounds
+from vla.runs.resume import cached_report, has_rounds
 from vla.schedule import Delays
 from vla.spec import FIRST_SEED, IN_DISTRIBUTION, Multitask
 
@@ -58,13 +58,12 @@ def run(experiment: Experiment) -> float | None:
 
     The result is None in all but the first process of a training, and if no episodes are left to evaluate on.
     """
-    require_possible(experiment)
-    agent = experiment.make_agent()
+    statements, agent = require_possible(experiment), experiment.make_agent()
     checkpoint = None if agent else experiment.checkpoint or _train(experiment)
     if checkpoint is agent is None:
         return None
     if experiment.playable:
-        return evaluate_closed_loop(experiment, checkpoint)
+        return evaluate_closed_loop(experiment, checkpoint, statements)
     from vla.jobs.open_loop import evaluate_open_loop  # imports Lightning, which takes seconds, as training does
 
     return evaluate_open_loop(experiment, checkpoint)
@@ -81,18 +80,20 @@ def _train(experiment: Experiment) -> Path | None:
     return None
 
 
-def evaluate_closed_loop(experiment: Experiment, checkpoint: Path | None) -> float:
-    """Return the success rate of a policy, or of the agent of the config.
+def evaluate_closed_loop(experiment: Experiment, checkpoint: Path | None, statements: Sequence[Statement]) -> float:
+    """Return the success rate of a policy, or of the agent of the config, and print it after what was to be decided.
 
     A finished evaluation of a policy is not repeated, and an unfinished one continues after the episodes that were
     played. If an episode ended in an error, a UserError is raised after the report, which contains it, is written.
     """
     output, identity = experiment.output, _identity(experiment, checkpoint)
     weights = identity["weights"]
-    if checkpoint and (success := cached_success(output, experiment.config, checkpoint, weights)) is not None:
+    if checkpoint and (finished := cached_report(output, experiment.config, checkpoint, weights)):
         try_write_page(output)  # once more, because a kill or a full disk may have left none, or an older one
-        return success
-    statements, conclusions = _statements(experiment), list[str]()
+        report = finished.reports[IN_DISTRIBUTION]
+        _conclude([*finished.statements, str(report)])
+        return report.success
+    conclusions = list[str]()
     _ = experiment.origin, experiment.changes  # determine them now, before the code may change
     try:
         with PlayedEpisodes(output, identity) as played:
@@ -112,9 +113,14 @@ def evaluate_closed_loop(experiment: Experiment, checkpoint: Path | None) -> flo
                 hint = f"the same evaluation with output={output} plays only these again"
                 raise UserError(f"{counted(errors, 'episode')} ended in an error, see {output / REPORT}: {hint}")
     finally:
-        for line in conclusions:  # after whatever was logged, because scripts read the last line
-            print(escape(line))
+        _conclude(conclusions)
     return report.success
+
+
+def _conclude(conclusions: Sequence[str]) -> None:
+    """Print the conclusions, after whatever was logged, because scripts read the last line."""
+    for line in conclusions:
+        print(escape(line))
 
 
 def _identity(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]:
@@ -212,8 +218,8 @@ def _play(
     return {name: reports.get(name, training) for name in (IN_DISTRIBUTION, *options.changes, *reports)}
 
 
-def require_possible(experiment: Experiment) -> None:
-    """Check, before any work, that the evaluation can be completed.
+def require_possible(experiment: Experiment) -> list[Statement]:
+    """Check, before any work, that the evaluation can be completed, and return what it is to decide.
 
     Raises a UserError if the run to compare with or a store is missing, there is nothing to decide, a policy, a
     network, a condition or a tier is impossible, or the episodes selected the weights or are not distinct.
@@ -223,7 +229,7 @@ def require_possible(experiment: Experiment) -> None:
     for name in (settings.checkpoint, settings.pretrained):
         if name:
             require_unseen(name, "evaluate.seed", options.seeds)  # whatever `validate` is now
-    _statements(experiment)
+    statements = _statements(experiment)  # before a training that goes on archives the report of its run
     if not experiment.nodes.get("agent"):
         _require_usable(experiment)
     for node in options.networks.values():
@@ -258,6 +264,15 @@ def require_possible(experiment: Experiment) -> None:
                 _require_distinct(name, world, options)
                 if trains and not changes:
                     _require_unseen_in_validation(world, experiment.validate.seeds, options.seeds)
+                elif not changes and experiment.checkpoint and (selected := _validation(experiment.checkpoint)):
+                    _require_unseen_in_validation(world, selected, options.seeds)
+    return statements
+
+
+def _validation(checkpoint: Path) -> range | None:
+    """Return the seeds whose episodes selected the weights of a policy, if that is known."""
+    validation = read_policy(checkpoint).training.validation
+    return range(validation[0], sum(validation)) if validation else None
 
 
 def _changed_parts(changes: Mapping[str, Any]) -> frozenset[tuple[str, ...]]:
@@ -289,7 +304,7 @@ def _require_unseen_in_validation(world: Any, validation: range, evaluation: ran
     if world.distinct([*validation, *evaluation]) < world.distinct(validation) + world.distinct(evaluation):
         raise UserError(
             f"validate.seed={validation.start} and evaluate.seed={evaluation.start} share initial states, but episodes "
-            f"that select the weights must not evaluate them: set validate.seed={2 * FIRST_SEED}"
+            f"that select the weights must not evaluate them: train with validate.seed={2 * FIRST_SEED}"
         )
 
 

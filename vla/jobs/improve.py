@@ -30,6 +30,7 @@ from vla.jobs.train import train
 from vla.models.policy_folder import read_policy
 from vla.rollouts.collect import collect
 from vla.rollouts.rollout import close_agent
+from vla.rollouts.statements import Statement
 from vla.rollouts.supervised import SupervisedAgent, require_memoryless
 from vla.runs.folder import EPISODES, archive_evaluation, read_report, read_run, save_config
 from vla.runs.resume import LENGTHS, training_lock
@@ -45,17 +46,17 @@ def run(experiment: Experiment) -> float:
 
     Raises a UserError if the expert cannot label, seeds are not new, or the folder has a round of another policy.
     """
-    seeds = _require_possible(experiment)
+    seeds, statements = _require_possible(experiment)
     main_store = complete_store(experiment)
     for store in (*([main_store] if main_store else ()), *map(EpisodeStore, experiment.collect.more or ())):
         require_new(seeds, store)
     with training_lock(experiment.output):
         _save_config(experiment)
         require_new(seeds, demonstrations(experiment))
-        return _improve(experiment, seeds)
+        return _improve(experiment, seeds, statements)
 
 
-def _improve(experiment: Experiment, seeds: range) -> float:
+def _improve(experiment: Experiment, seeds: range, statements: Sequence[Statement]) -> float:
     options, output = experiment.options(Rounds), experiment.output
     checkpoint, stores = experiment.pretrained, list[Path]()
     if (report := read_report(output)) and (count := value_at(report.config, "improve.rounds", 0)) != options.rounds:
@@ -69,7 +70,7 @@ def _improve(experiment: Experiment, seeds: range) -> float:
         successes = sum(entry.success for entry in store.episodes)
         log.info("round %d: success in %d of %s", number, successes, counted(len(store.episodes), "labelled episode"))
         checkpoint = _train(_round(experiment, checkpoint, folder, stores))
-    return evaluate_closed_loop(experiment, checkpoint)
+    return evaluate_closed_loop(experiment, checkpoint, statements)
 
 
 def _save_config(experiment: Experiment) -> None:
@@ -85,9 +86,10 @@ def _save_config(experiment: Experiment) -> None:
         save_config(experiment.output, experiment.config, experiment.changes)
 
 
-def _require_possible(experiment: Experiment) -> range:
-    """Return the seeds of all rounds; raise a UserError if evaluation reserves them, or the rounds cannot be played."""
-    require_possible(experiment)
+def _require_possible(experiment: Experiment) -> tuple[range, list[Statement]]:
+    """Return the seeds of all rounds, and what the evaluation is to decide; raise a UserError if evaluation reserves
+    them, or the rounds cannot be played."""
+    statements = require_possible(experiment)
     options = experiment.options(Rounds)
     seeds = options.seeds
     if seeds.stop > FIRST_SEED:
@@ -109,7 +111,7 @@ def _require_possible(experiment: Experiment) -> range:
             environment.spec.require(variant.spec, "the task", "the task with improve.changes")
             with variant.blind():
                 variant.reset(seeds.start)
-    return seeds
+    return seeds, statements
 
 
 def _require_further_episodes(experiment: Experiment, policy: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vla.config.differences import value_at
-from vla.config.nodes import conditions, with_changes
+from vla.config.nodes import with_changes
 from vla.io.errors import UserError
 from vla.reports.result_tables import secondary_table
 from vla.reports.tables import DIFFERENCE, Table, difference
@@ -18,6 +19,7 @@ from vla.rollouts.results import ERROR, Report, Result
 from vla.rollouts.statistics import effective_episodes
 from vla.runs.folder import Run, require_run
 from vla.runs.sweep import SweepRow
+from vla.spec import IN_DISTRIBUTION
 
 # Names of the second row, of the first one, and condition → what is compared → comparison.
 Comparisons = Mapping[tuple[str, ...], Mapping[str, Comparison]]
@@ -63,8 +65,7 @@ def compare(pairs: Iterable[tuple[SweepRow, SweepRow]], margin: float) -> Compar
 
 def _repeats_training_condition(runs: Sequence[Run], condition: str) -> bool:
     """Return whether a condition changes the task of none of the runs, so that its episodes are those of `seen`."""
-    tasks = [(value_at(run.report.config, "task", {}), _changes(run, condition)) for run in runs if run.report]
-    return all(changes is not None and with_changes(task, changes) == task for task, changes in tasks)
+    return condition != IN_DISTRIBUTION and all(run.reports[condition] is run.reports[IN_DISTRIBUTION] for run in runs)
 
 
 def _compare_rows(one: SweepRow, other: SweepRow, condition: str) -> dict[str, Comparison]:
@@ -76,7 +77,7 @@ def _compare_rows(one: SweepRow, other: SweepRow, condition: str) -> dict[str, C
         return compare_results(together, anytime)
     first, second = (_by_seed(run, condition) for run in runs)
     if common_seeds := first.keys() & second.keys():  # then each of them must be of the same world in both samples
-        same_world = all(first[seed][1] == second[seed][1] for seed in common_seeds)
+        same_world = not any(first[seed][1].isdisjoint(second[seed][1]) for seed in common_seeds)
     else:
         same_world = _scenes(runs[0], condition) == _scenes(runs[1], condition)
     if anytime or not (first and second and same_world):
@@ -136,19 +137,28 @@ def common_episodes(one: Run, other: Run, condition: str) -> list[tuple[Result, 
     """Return both results of every episode that two runs completed under a condition, in the order of seeds."""
     first, second = (_by_seed(run, condition) for run in (one, other))
     # The same seed gives another episode under another goal or level of randomisation.
-    seeds = [seed for seed, (_, scene) in first.items() if seed in second and scene == second[seed][1]]
-    return [(first[seed][0], second[seed][0]) for seed in sorted(seeds)]
+    seeds = [seed for seed in sorted(first.keys() & second.keys()) if not first[seed][1].isdisjoint(second[seed][1])]
+    return [(first[seed][0], second[seed][0]) for seed in seeds]
 
 
-def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
-    """Return seed → result under a condition, and a key that is equal for equal scene and instruction.
+def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, set[str]]]:
+    """Return seed → result under a condition, and keys of which one is equal for equal scene and instruction.
 
-    For other conditions than the first, and for some worlds, only the config tells what was drawn.
+    Where no draws are saved, as under other conditions than the first, the config must be equal, or the episode of the
+    first condition and what is changed.
     """
-    results, scenes = run.reports.get(condition, Report(())).results, _scenes(run, condition)
+    scenes, changes = _scenes(run, condition), _changes(run, condition)
+    training = run.reports.get(IN_DISTRIBUTION, Report(())).results
+    drawn = {each.seed: {_key(each.episode, changes, scenes[1:])} for each in training if each.draws}
     return {
-        each.seed: (each, (each.episode, None if each.draws else scenes)) for each in results if each.outcome != ERROR
+        each.seed: (each, {_key(each.episode, None if each.draws else scenes)} | drawn.get(each.seed, set()))
+        for each in run.reports.get(condition, Report(())).results
+        if each.outcome != ERROR
     }
+
+
+def _key(*values: Any) -> str:
+    return json.dumps(values, sort_keys=True, default=str)
 
 
 def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
@@ -161,5 +171,4 @@ def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
 
 def _changes(run: Run, condition: str) -> dict[str, Any] | None:
     """Return what a condition changes in the task; None if it changes the agent, or is unknown."""
-    evaluate = value_at(run.report.config if run.report else {}, "evaluate", {})
-    return conditions(evaluate.get("conditions", {}), evaluate.get("one_by_one", {})).get(condition)
+    return run.report.changes.get(condition) if run.report else None

@@ -54,7 +54,7 @@ def write_page(folder: Path) -> Path:
         _rollouts(run),
         Section("Episodes", PLAYED_NOTE, panels=svgs(episode_panels(report)) if report else {}),
         *([conditions_table(run.reports, compared)] if conditions else []),
-        secondary_table({(name,): metrics for name, metrics in compared.items()}),
+        secondary_table({(name,): metrics for name, metrics in compared.items() if run.reports[name] is not report}),
         *(rate_tables(report) if report else ()),
         *training_sections([(GREEN, run.metrics)]),
         Section("First training batch", WINDOWS, picture=folder / SAMPLES),

@@ -12,7 +12,7 @@ from pydantic import AfterValidator
 from vla.config.annotations import mismatch
 from vla.config.build import arguments
 from vla.config.differences import ABSENT, value_at
-from vla.config.nodes import Evaluation
+from vla.config.nodes import Evaluation, conditions, with_changes
 from vla.config.origin import Origin
 from vla.io.documents import LENIENT, STRICT
 from vla.io.errors import UserError
@@ -153,9 +153,20 @@ class ReportFile:
 
     @cached_property
     def reports(self) -> dict[str, Report]:
-        """Condition → report, the training condition first."""
+        """Condition → report, the training condition first; it is also that of conditions that change nothing."""
         tiers = value_at(self.config, "task.tiers", None) or {}  # also with tasks that were not played
         # Without tiers a condition may change the task of an episode; in a benchmark the task follows from the seed.
         tasks = [result.task if tiers else "" for result in self.per_episode]
-        conditions = {name: part.report(self.seeds, tasks, tiers) for name, part in self.conditions.items()}
-        return {IN_DISTRIBUTION: Report(tuple(self.per_episode), tiers, self.anytime), **conditions}
+        training, task = Report(tuple(self.per_episode), tiers, self.anytime), value_at(self.config, "task", {})
+        equal = {name for name, changes in self.changes.items() if with_changes(task, changes) == task}
+        others = {
+            name: training if name in equal else part.report(self.seeds, tasks, tiers)
+            for name, part in self.conditions.items()
+        }
+        return {IN_DISTRIBUTION: training, **others}
+
+    @cached_property
+    def changes(self) -> dict[str, dict[str, Any]]:
+        """Condition that changes the task → its changes."""
+        evaluate = value_at(self.config, "evaluate", {})
+        return conditions(evaluate.get("conditions", {}), evaluate.get("one_by_one", {}))

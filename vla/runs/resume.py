@@ -15,8 +15,8 @@ from vla.io.errors import UserError, counted
 from vla.io.files import try_lock
 from vla.models.checkpoint import Header, read_header
 from vla.models.policy_folder import POLICY, read_policy
+from vla.runs.files import ReportFile
 from vla.runs.folder import CHECKPOINTS, LAST, REPORT, read_report
-from vla.spec import IN_DISTRIBUTION
 
 log = logging.getLogger(__name__)
 
@@ -66,9 +66,9 @@ def has_rounds(folder: Path) -> bool:
     return any(folder.glob(f"round_*/{CHECKPOINTS}"))
 
 
-def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path, weights: str) -> float | None:
-    """Return the success rate in a run's report; None unless it is of the same policy, with the digest `weights`, and
-    of the same evaluation, and without errors."""
+def cached_report(folder: Path, config: Mapping[str, Any], checkpoint: Path, weights: str) -> ReportFile | None:
+    """Return the report of a run; None unless it is of the same policy, with the digest `weights`, and of the same
+    evaluation, and without errors."""
     report = read_report(folder)
     if report is None or report.checkpoint != str(checkpoint) or report.weights != weights:
         return None
@@ -80,7 +80,7 @@ def cached_success(folder: Path, config: Mapping[str, Any], checkpoint: Path, we
     if any(part.errors for part in report.reports.values()) or differences(report.config, config):
         return None
     log.info("evaluation is already finished: %s", folder / REPORT)
-    return report.reports[IN_DISTRIBUTION].success
+    return report
 
 
 def newest_run(runs: Path) -> Path:
