@@ -46,7 +46,7 @@ from vla.models.policy_folder import read_policy
 from vla.models.trunk_folder import is_trunk
 from vla.models.vision.timm_encoders import FilmEfficientNet
 from vla.models.vlm.lerobot_export import LeRobotPolicyExporter
-from vla.models.vlm.normalizer import Normalizer
+from vla.models.vlm.normalizer import Kind, Normalizer
 from vla.models.vlm.policy import resize_with_padding
 from vla.models.vlm.prompt import PADDING, WORDS, Prompt
 from vla.models.vlm.smolvla import SmolVLA
@@ -177,6 +177,22 @@ def test_without_a_tokenizer_tokens_are_words() -> None:
     assert (none != PADDING).sum() == 1 and torch.equal(prompt.tokenize([""]), none[None])
     with pytest.raises(UserError, match=r"model\.network\.vocabulary=320 is less than the 4096 words"):
         make_smolvla(network=partial(SmolVLA, **SMOLVLA))
+
+
+def test_a_tokenizer_of_more_words_than_the_network_is_refused(tokenizer: Path) -> None:
+    count = Prompt(str(tokenizer), 20, state=False, width=1).words
+    with pytest.raises(
+        UserError, match=rf"vocabulary=9 is less than the {count} words of a prompt for the tokenizer of"
+    ):
+        make_smolvla(tokenizer, network=partial(SmolVLA, **SMOLVLA | {"vocabulary": 9}))
+
+
+@pytest.mark.parametrize("normalization", ["mean_std", "quantiles"])
+def test_motions_that_are_noise_in_the_demonstrations_are_no_huge_numbers(normalization: Kind) -> None:
+    model, noise = make_smolvla(normalization=normalization), np.ones(len(SPEC.action), np.float32)
+    noise[-1] = 1e-5
+    model.fit(steps(len(SPEC.state)), steps(len(SPEC.action)) * noise)
+    assert 1 < model.scaled(torch.tensor([SPEC.high]))[0, len(SPEC.action) - 1].abs() < 100
 
 
 def test_a_model_with_keypoints_overfits_saves_and_ignores_truth() -> None:
@@ -352,6 +368,18 @@ def test_other_weights_are_refused(tmp_path: Path, tokenizer: Path, change: Any,
     folder = written(tmp_path / "published", tokenizer, change)
     with pytest.raises(UserError, match=sentence):
         make_smolvla(tokenizer, trunk=str(folder))
+
+
+def test_a_policy_of_an_older_lerobot_that_was_compiled_is_the_same(tmp_path: Path, tokenizer: Path) -> None:
+    def older(weights: dict[str, torch.Tensor]) -> None:
+        for name in [*weights]:
+            weights[name.replace("model.", "model._orig_mod.", 1)] = weights.pop(name)
+        weights["normalize_inputs.buffer_observation_state.mean"] = torch.zeros(6)
+        weights["unnormalize_outputs.buffer_action.std"] = torch.ones(6)
+
+    folders = written(tmp_path / "published", tokenizer), written(tmp_path / "older", tokenizer, older)
+    one, other = (make_smolvla(tokenizer, trunk=str(folder)).network.state_dict() for folder in folders)
+    assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
 
 
 @pytest.mark.parametrize(

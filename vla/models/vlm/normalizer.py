@@ -41,20 +41,23 @@ class Normalizer(nn.Module):
         self.register_buffer(self.statistics[0], identity)
         self.register_buffer(self.statistics[1], torch.ones(width))
 
-    def fit(self, values: np.ndarray, constant: float = 0.0) -> None:
+    def fit(self, values: np.ndarray, floor: np.ndarray | float = 0.0, constant: float = 0.0) -> None:
         """Compute the statistics of (N, W) values.
 
         The extremes of a component that rarely changes, such as a gripper, take the place of its percentiles, or its
-        changes would be huge. One that never changes gets `constant` as its standard deviation, or half its range.
+        changes would be huge. One that never changes gets `constant` as its standard deviation, or half its range, and
+        of the others both are at least `floor`: what is noise in these values may be a motion in others.
         """
         minimum, maximum = values.min(0), values.max(0)
-        spread = np.where(maximum - minimum > CONSTANT, 0.0, constant)
+        floor = np.where(maximum - minimum > CONSTANT, floor, np.maximum(floor, constant))
         if self.kind == "mean_std":
-            estimates = values.mean(0, dtype=np.float64), values.std(0, dtype=np.float64) + spread
+            estimates = values.mean(0, dtype=np.float64), np.maximum(values.std(0, dtype=np.float64), floor)
         else:
             low, high = np.quantile(values, (0.01, 0.99), axis=0)
             rare = high - low <= RARE * (maximum - minimum)
-            estimates = np.where(rare, minimum, low) - spread, np.where(rare, maximum, high) + spread
+            low, high = np.where(rare, minimum, low), np.where(rare, maximum, high)
+            widening = np.maximum(floor - (high - low) / 2, 0.0)
+            estimates = low - widening, high + widening
         for name, value in zip(self.statistics, estimates, strict=True):
             getattr(self, name).copy_(torch.from_numpy(value))
 

@@ -21,13 +21,13 @@ from torch import Tensor
 from vla.io.errors import UserError
 from vla.io.types import Natural, NonNegative, Shift, Steps, Text
 from vla.models.chunking import after_prefix, require_prefix, with_prefix
-from vla.models.layers import Batch, mean_where, newest_index, random_arguments
+from vla.models.layers import Batch, RunningNormalizer, mean_where, newest_index, random_arguments
 from vla.models.model import Model, Prediction
-from vla.models.tokenizers.tokenizer import ActionTokenizer
+from vla.models.tokenizers.tokenizer import MIN_SPAN, ActionTokenizer
 from vla.models.vlm.network import FlowNetwork, Prefix
 from vla.models.vlm.normalizer import Kind, Normalizer
 from vla.models.vlm.packed_linear import pack
-from vla.models.vlm.prompt import PADDING, WORDS, Prompt
+from vla.models.vlm.prompt import PADDING, Prompt
 from vla.models.vlm.trunk import Trunk, sketch
 from vla.spec import Spec
 
@@ -103,10 +103,11 @@ class VisionLanguageAction(Model):
         if origin is None:
             sketch(network)  # a UserError, before any weight is drawn, if they need more memory than is free
         self.network = origin.build(network) if origin else network()
-        if self.text.name is None and self.network.vocabulary < WORDS:
+        if self.network.vocabulary < self.text.words:
+            whose = "without a tokenizer" if self.text.name is None else f"for the tokenizer of {self.text.name}"
             raise UserError(
-                f"model.network.vocabulary={self.network.vocabulary} is less than the {WORDS} words of a prompt "
-                "without a tokenizer: raise it, or give model.text.name"
+                f"model.network.vocabulary={self.network.vocabulary} is less than the {self.text.words} words of a "
+                f"prompt {whose}: raise it, or give another model.text.name"
             )
         self.add_truth_head(self.network.value_width, auxiliary)
         pack(self.network)
@@ -130,8 +131,9 @@ class VisionLanguageAction(Model):
             text = "%s sees the state in the sentence only, and it is not there: model.text.state=true adds it"
             log.warning(text, type(self.network).__name__)
         if self.statistics == "demonstrations":
-            self.state_normalizer.fit(states[:, self.spec.pose], constant=1.0)
-            self.action_normalizer.fit(actions)
+            allowed = np.array(self.spec.high) - np.array(self.spec.low)
+            self.state_normalizer.fit(states[:, self.spec.pose], floor=RunningNormalizer.MIN_STD, constant=1.0)
+            self.action_normalizer.fit(actions, floor=MIN_SPAN / 4 * allowed)
 
     def encode_prefix(self, batch: Batch) -> Prefix:
         """Encode the newest frame and the sentence."""

@@ -67,6 +67,12 @@ class Prompt(TextEncoder):
                     "choose another one"
                 )
 
+    @property
+    def words(self) -> int:
+        """Size of the vocabulary that sentences need."""
+        vocabulary = {} if self._tokenizer is None else self._tokenizer.get_vocab(with_added_tokens=False)
+        return 1 + max(vocabulary.values(), default=WORDS - 1)
+
     def tokenize(self, sentences: list[str]) -> Tensor:
         """Return (B, L) int64 tokens, `PADDING` after the end; L is the longest sentence rounded up to `STEP`s."""
         texts = [

@@ -26,6 +26,7 @@ PREPROCESSOR = "policy_preprocessor.json"
 NORMALIZER = "normalizer_processor"  # its step that normalises
 IMAGES = "observation.images."
 EMBEDDING = "embed_tokens.weight"  # end of the name of the embedding of words
+OLD_STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")  # of LeRobot before 0.4
 KINDS = ("smolvla", "pi0", "pi05")  # of policies of LeRobot
 # Options of LeRobot's policies that change what is computed → values that are supported here. With 0 layers or less the
 # expert has as many as the trunk, and with a length of 0 or less a prefix is not padded: smolvla_base has 0 for both.
@@ -122,7 +123,9 @@ class Trunk:
         parameters = dict(instance.named_parameters())
         weights = dict[str, Tensor]()
         for key, tensor in _tensors(self._files):
-            name = rename_weight(key, instance.published_names if self.is_policy else instance.trunk_names)
+            names = instance.published_names if self.is_policy else instance.trunk_names
+            plain_key = key.replace("._orig_mod.", ".")  # of a policy that was compiled
+            name = rename_weight(plain_key, names)
             if name in parameters:
                 if name.endswith(EMBEDDING) and not self.is_policy:
                     tensor = tensor[: len(parameters[name])]  # the rest pads a vocabulary
@@ -130,7 +133,7 @@ class Trunk:
                     shapes = f"{[*tensor.shape]}, and the model has {[*parameters[name].shape]}"
                     raise UserError(f"{key} in {self} has shape {shapes}: choose another model= or model.network")
                 weights[name] = tensor.to(torch.float32, copy=True)
-            elif self.is_policy and not key.startswith(instance.unused_names):
+            elif self.is_policy and not plain_key.startswith((*instance.unused_names, *OLD_STATISTICS)):
                 raise UserError(f"{self} has {key}, which the model lacks: choose another model= or model.network")
         prefixes = ("",) if self.is_policy else tuple(prefix for _, prefix in instance.trunk_names)
         if missing_names := [name for name in parameters if name not in weights and name.startswith(prefixes)]:
