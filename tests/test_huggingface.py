@@ -168,8 +168,11 @@ def deeper(folder: Path) -> None:
 )
 def test_what_is_no_encoder_is_told_in_one_line(change: Callable[[Path], object], reason: str, tmp_path: Path) -> None:
     change(write_encoder(tmp_path / "encoder"))
-    with pytest.raises(UserError, match=rf"^\S+/encoder is no text encoder as save_pretrained writes them: .*{reason}"):
+    with pytest.raises(
+        UserError, match=rf"^\S+/encoder is no text encoder as save_pretrained writes them: .*{reason}"
+    ) as told:
         HuggingFace(str(tmp_path / "encoder"), width=8)
+    assert len(str(told.value)) < 600
 
 
 @pytest.mark.parametrize("name", ["nowhere", "somebody/encoder@v1", "/nowhere/at/all"])

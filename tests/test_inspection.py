@@ -220,13 +220,17 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path: Path) -> None:
 def test_two_processes_do_not_write_one_new_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = add(tmp_path / "store", EPISODES)
 
+    called = []
+
     def meanwhile(items: list[Any], description: str) -> list[Any]:
+        called.append(description)
         with pytest.raises(UserError, match=r"another process writes .*new: wait for it"):
             derive_store([store], tmp_path / "inner/new")
         return items
 
     monkeypatch.setattr("vla.data.derivation.track", meanwhile)
     derive_store([store], tmp_path / "inner/new")
+    assert called == ["writing"]
     assert verify_store(EpisodeStore(tmp_path / "inner/new")).intact_entries == store.episodes
     assert [path.name for path in (tmp_path / "inner").iterdir()] == ["new"]
 

@@ -599,7 +599,7 @@ def test_a_table_larger_than_recordings_are_is_not_read(
 )
 def test_rows_of_other_lengths_are_no_vectors(rows: Any, size: int, fits: bool) -> None:
     found = tables.vectors(pa.chunked_array([pa.array(rows)]), size)
-    assert found.ravel().tolist() == np.ravel(rows).tolist() if fits and found is not None else found is None
+    assert (None if found is None else found.ravel().tolist()) == (np.ravel(rows).tolist() if fits else None)
 
 
 def test_no_flipped_bit_is_imported(home: Path, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ from vla.reports.evaluation import write_report
 from vla.reports.observations import draw_samples
 from vla.reports.run_page import write_page
 from vla.reports.training_curves import training_sections
-from vla.rollouts.moving_picture import save_moving_picture
+from vla.rollouts.moving_picture import FRAMES, save_moving_picture
 from vla.rollouts.recorder import RerunRecorder
 from vla.rollouts.recordings import keep_pictures, merge_recordings, moving_pictures
 from vla.rollouts.results import Report, Result, recording_name
@@ -112,9 +112,14 @@ def test_failures_move_first_and_every_camera_is_shown(whole: Path) -> None:
 
 def test_long_episodes_move_faster(tmp_path: Path) -> None:
     seen, actions = make_environment().reset(0), np.zeros((200, 3), np.float32)
-    episode = Episode(7, "a", seen.instruction, "dropped", frozenset(), {}, [seen] * 200, actions, actions)
+    steps = [
+        replace(seen, rgb={name: np.full_like(image, 37 * number % 256) for name, image in seen.rgb.items()})
+        for number in range(200)
+    ]
+    episode = Episode(7, "a", seen.instruction, "dropped", frozenset(), {}, steps, actions, actions)
     save_moving_picture(episode, tmp_path / "one.webp")
-    assert Image.open(tmp_path / "one.webp").format == "WEBP"
+    picture = Image.open(tmp_path / "one.webp")
+    assert (picture.format, getattr(picture, "n_frames", 1)) == ("WEBP", FRAMES)
 
 
 def test_outcomes_take_turns_in_what_is_shown(tmp_path: Path) -> None:

@@ -46,7 +46,9 @@ def test_batch_normalisation_over_processes_keeps_the_activations() -> None:
     images, text = torch.rand(2, 3, 64, 64), torch.randn(2, 8)
     with torch.inference_mode():
         expected = network(images, text)
-        assert torch.allclose(SyncBatchNorm().apply(network)(images, text), expected, atol=1e-5)
+        synchronised = SyncBatchNorm().apply(network)
+        assert any(isinstance(module, torch.nn.SyncBatchNorm) for module in synchronised.modules())
+        assert torch.allclose(synchronised(images, text), expected, atol=1e-5)
 
 
 NETWORKS = [("test_vit", 32), ("test_resnet", None), ("test_vit3", 32), ("test_vit4", None)]

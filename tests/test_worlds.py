@@ -93,6 +93,7 @@ def test_where_a_new_instruction_needs_an_image_only_its_episode_is_run_again() 
 def test_an_agent_of_one_world_plays_in_one() -> None:
     expert = ToyExpert()
     played = dict(play(worlds(1), as_agents(expert), [4, 1]))
+    assert [*played] == [4, 1]
     for seed, episode in played.items():
         np.testing.assert_array_equal(episode.executed, rollout(ToyEnvironment(), expert, seed).executed)
     with pytest.raises(ValueError, match=r"ToyInTurn has no `info`: set self\.info"):

@@ -63,7 +63,7 @@ class _SentenceEncoder:
             self._tokenizer = _tokenizer(folder, self.network.config)
             self.embed("a sentence")
         except Exception as error:  # transformers, tokenizers and safetensors have no error in common
-            reason = lines_of(error)[0]
+            reason = lines_of(error)[0][:300]  # some list all models
             raise UserError(f"{folder} is no text encoder as save_pretrained writes them: {reason}") from error
         digest = hashlib.sha256()
         for path in sorted(folder.glob(WEIGHTS)):
