@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from pathlib import Path
@@ -49,6 +50,14 @@ def test_the_policy_acts_in_the_world_as_it_was_evaluated(home: Path) -> None:
     acted = policy.act(observation)
     policy.reset(observation["instruction"], 1_000_000)
     np.testing.assert_array_equal(acted, policy.act(same))
+    observation, _ = world.reset(seed=1_000_000)
+    policy.reset(observation["instruction"], 1_000_000)
+    steps, over = 0, False
+    while not over:
+        observation, _, terminated, truncated, _ = world.step(policy.act(observation))
+        steps, over = steps + 1, terminated or truncated
+    first = json.loads((home / "run/report.json").read_text())["per_episode"][0]
+    assert (world.environment.outcome, steps) == (first["outcome"], first["steps"])
     world.close()
     changed = load_environment(home / CHECKPOINT, changes={"time_limit": 0.1})
     changed.reset(seed=1_000_000)
