@@ -19,6 +19,15 @@ SECRET = "hunter2secret"
 HIDDEN = {"python": r"_target_ must name a class", "secret": "holds the reference"}  # what is said of it
 
 
+def sentence(attack: str, way: str) -> str | None:
+    """What is said of an attack on a way to use the policy; None if nothing that is hidden is read there."""
+    if "connection" not in attack:
+        return next(said for word, said in HIDDEN.items() if word in attack)
+    if way == "improve":
+        return r"names a path or an address in expert\."
+    return r"expert\.url must be" if way == "evaluate" and "recording" in attack else None
+
+
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_nothing_that_is_hidden_acts(attack: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -28,13 +37,15 @@ def test_nothing_that_is_hidden_acts(attack: str, tmp_path: Path, monkeypatch: p
         config = hiding(to_plain(composed("expert=waypoint", "trainer.accelerator=cpu")), mark, port)[attack]
         path = save(tmp_path / "theirs", config)
         small = ("output=mine", "cluster.workers=1", "evaluate.episodes=1", "recorder=none")
+        refused = 0
         for way, do in ways(path, *small).items():
-            says = next((said for word, said in HIDDEN.items() if word in attack), None)
-            with pytest.raises(ValueError, match=says or ("in expert" if way == "improve" else None)):
+            if not (says := sentence(attack, way)):
+                continue
+            with pytest.raises(ValueError, match=says):
                 do()
+            refused += 1
             assert not mark.exists() and not connected(), way
-    written = [file for file in (tmp_path / "mine").rglob("*") if file.is_file()]
-    assert not any(SECRET in file.read_bytes().decode("latin-1") for file in written)
+    assert refused and not [*(tmp_path / "mine").rglob("*")]
 
 
 @pytest.mark.parametrize("attack", hidden(to_plain(composed()), Path()))
