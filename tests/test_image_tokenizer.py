@@ -7,6 +7,7 @@ from copy import deepcopy
 import pytest
 import torch
 from torch import nn
+from torch._inductor import config as inductor
 
 from vla.models.compilation import prepare_compilation
 from vla.models.vision.image_tokenizer import FiLM, FilmConv, Keypoints, RandomShift, TokenLearner
@@ -139,13 +140,16 @@ def test_what_is_shifted_beyond_the_border_is_black() -> None:
     assert (rows.sum(1) < 32).sum() > 8 and (columns.sum(1) >= 16).all()
 
 
-def test_compiled_in_half_precision_it_has_the_same_gradients() -> None:
+def test_compiled_in_half_precision_it_has_the_same_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
     eager = nn.Sequential(nn.SiLU(), Keypoints(32, 16))
     compiled = deepcopy(eager)
     features = torch.randn(8, 32, 16, 16, dtype=torch.bfloat16).to(memory_format=torch.channels_last)
     direction, gradients = torch.randn(8, 16, 34), list[torch.Tensor]()
     prepare_compilation()
+    # Without a program that tries the compiler, and without processes that compile.
+    monkeypatch.setattr(inductor.cpp, "vec_isa_ok", True)
+    monkeypatch.setattr(inductor, "compile_threads", 1)
     compiled.compile()
     for model in (eager, compiled):
         seen = features.clone().requires_grad_()
