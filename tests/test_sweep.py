@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 import weakref
 from collections.abc import Callable
@@ -231,6 +232,20 @@ def test_rows_of_the_same_scenes_in_other_pictures_are_compared_under_conditions
         drawn = [f"task.image_size=[{size},{size}]"]
         cell(tmp_path, number, drawn, 5, config=config, draws=lambda n: {"blocks": n})
     assert [condition for _, _, condition in compare_rows(tabulate(tmp_path))] == ["seen", "dark"]
+
+
+def test_cells_on_recordings_are_compared_by_their_errors(tmp_path: Path) -> None:
+    for number, (model, seed, relative) in enumerate([("act", 0, 0.5), ("act", 1, 0.7), ("bc", 0, 0.8)]):
+        (folder := tmp_path / str(number) / ".hydra").mkdir(parents=True)
+        (folder / "overrides.yaml").write_text(f"- model={model}\n- seed={seed}\n")
+        part = {"name": "x", "unit": "1", "error": 1.0, "ci_low": 1.0, "ci_high": None, "constant": 2.0}
+        errors = {"seeds": [3, 8], "components": [part], "relative": relative, "checkpoint": None, "config": {}}
+        (folder.parent / "errors.json").write_text(json.dumps({**errors, "latency_ms": 3.0 + number}))
+    assert len(tabulate(tmp_path)) == 2
+    table = (tmp_path / "sweep.md").read_text()
+    assert "| act | 0.600 |" in table and "| bc | 0.800 |" in table and "| 5.0 |" in table
+    page = (tmp_path / "sweep.html").read_text()
+    assert "0.600" in page and "not compared" not in page and not (tmp_path / "sweep.png").exists()
 
 
 def test_several_trainings_count_as_fewer_episodes_in_a_comparison(tmp_path: Path) -> None:

@@ -90,7 +90,8 @@ def _compare_rows(one: SweepRow, other: SweepRow, condition: str) -> dict[str, C
 def remarks(runs: Mapping[str, Run], comparisons: Comparisons | None = None) -> dict[str, str]:
     """Return remark → the names of the runs that it concerns; given comparisons, also the pairs that have none."""
     compared_pairs = dict.fromkeys((one, other) for other, one, _ in comparisons or ())
-    pairs = [] if comparisons is None else [pair for pair in combinations(runs, 2) if pair not in compared_pairs]
+    played = [] if comparisons is None else [name for name, run in runs.items() if run.report]
+    pairs = [pair for pair in combinations(played, 2) if pair not in compared_pairs]
     conditions_left_out = [
         f"{one} and {other} ({condition})"
         for one, other in compared_pairs

@@ -65,7 +65,8 @@ def tabulate(folder: Path) -> list[SweepRow]:
         texts = [*(table.markdown() for table in tables), "".join(f"- failed: {line}\n" for line in failure_lines)]
         write_text(folder / "sweep.md", "\n".join(filter(None, texts)))
         size = 4, max(2.5, 0.5 + 0.25 * len(rows))
-        save(folder / "sweep.png", success_panels(rows), 4, size, "success, 95 % CI")
+        if panels := success_panels(rows):
+            save(folder / "sweep.png", panels, 4, size, "success, 95 % CI")
         with warn_on_error(folder / SWEEP):
             facts = {f"failed cell {number}": line for number, line in enumerate(failure_lines, 1)}
             facts |= remarks({run.folder.name: run for row in rows for run in row.runs})
@@ -74,21 +75,25 @@ def tabulate(folder: Path) -> list[SweepRow]:
 
 
 def results_table(rows: Sequence[SweepRow], folder: Path | None = None) -> Table:
-    """Tabulate success under every condition and costs; for a page in `folder` also link to the pages of the runs."""
+    """Tabulate success under every condition, errors on recordings, and costs; for a page in `folder` also link to the
+    pages of the runs."""
     conditions, seeds = conditions_of(list(rows)), any(len(row.runs) > 1 for row in rows)
+    errors = ["error / constant"] if any(row.relative_error is not None for row in rows) else []
     costs = [*(["each seed [%]"] if seeds else []), "parameters [M]", "action [ms]", "steps", "training"]
     lines = []
     for row in rows:
         rates = [rate(row.interval(condition)) if condition in row.successes else ABSENT for condition in conditions]
+        rates += [ABSENT if (error := row.relative_error) is None else f"{error:.3f}"] if errors else []
         lines.append([*row.choices.values(), *rates, *_costs(row, seeds), *([_links(row, folder)] if folder else [])])
-    heads = [*rows[0].choices, *(f"{name} [%]" for name in conditions), *costs, *(["pages"] if folder else [])]
+    heads = [*rows[0].choices, *(f"{name} [%]" for name in conditions), *errors, *costs, *(["pages"] if folder else [])]
     details = [f"{name} [%]" for name in conditions[1:]] if len(conditions) > CONDITIONS else []
     return Table(heads, lines, "Success and cost", details=[*details, *costs])
 
 
 def _costs(row: SweepRow, seeds: bool) -> list[str]:
     run, training = row.runs[0], row.runs[0].training
-    latencies = [cell.report.latency_ms for cell in row.runs if cell.report and cell.report.latency_ms]
+    files = [file for cell in row.runs for file in (cell.report, cell.errors) if file]
+    latencies = [file.latency_ms for file in files if file.latency_ms]
     last_step = max((steps[-1] + 1 for steps, _ in run.metrics.values()), default=ABSENT)
     return [
         *([", ".join(map(percent, row.rates))] if seeds else []),

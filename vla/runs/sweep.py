@@ -13,7 +13,7 @@ from vla.io.documents import read_bounded, read_yaml
 from vla.io.files import write_text
 from vla.rollouts.results import ERROR
 from vla.rollouts.statistics import pooled_interval
-from vla.runs.folder import REPORT, Run, read_run
+from vla.runs.folder import ERRORS, REPORT, Run, read_run
 from vla.spec import IN_DISTRIBUTION
 
 OVERRIDES = ".hydra/overrides.yaml"  # written by Hydra in the folder of every cell
@@ -36,8 +36,14 @@ class SweepRow:
 
     @property
     def rates(self) -> list[float]:
-        """Success rate of every cell."""
-        return [run.reports[IN_DISTRIBUTION].success for run in self.runs]
+        """Success rate of every cell that has one."""
+        return [run.reports[IN_DISTRIBUTION].success for run in self.runs if run.reports]
+
+    @property
+    def relative_error(self) -> float | None:
+        """Mean error on recordings, as a fraction of that of a constant action; None without any."""
+        errors = [run.errors.relative for run in self.runs if run.errors]
+        return sum(errors) / len(errors) if errors else None
 
     @cached_property
     def successes(self) -> dict[str, list[dict[int, bool]]]:
@@ -69,11 +75,12 @@ def conditions_of(rows: list[SweepRow]) -> list[str]:
 
 
 def read_rows(folder: Path) -> list[SweepRow]:
-    """Read the rows of all cells that have a report and did not fail, in the order of the sweep."""
+    """Read the rows of all cells that were evaluated and did not fail, in the order of the sweep."""
     evaluations = [
         (overrides_of(cell), read_run(cell))
         for cell in cells(folder, OVERRIDES)  # other folders with a report are no cells
-        if (cell / REPORT).exists() and not (cell / FAILURE).exists()  # the report may be of other overrides
+        if any((cell / name).exists() for name in (REPORT, ERRORS))
+        and not (cell / FAILURE).exists()  # the report may be of other overrides
     ]
     keys = [key for key in varied_keys([overrides for overrides, _ in evaluations]) if key != SEED]
     rows: dict[tuple[str, ...], SweepRow] = {}
