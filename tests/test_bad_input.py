@@ -83,6 +83,13 @@ def test_bad_input_ends_in_one_clear_sentence(tmp_path: Path, line: str) -> None
     assert not [*tmp_path.glob("outputs/runs/*")]  # nothing was done
 
 
+def test_a_number_in_a_file_that_is_none_is_told_with_the_file(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/metrics.csv").write_text("step,loss\n1.5,1\n")
+    done = here(tmp_path, "job=report", "report.runs=[run]", ok=False)
+    assert "run/metrics.csv is damaged in line 2" in done.stderr
+
+
 @pytest.mark.parametrize("job", ["train", "improve"])
 def test_a_further_store_of_another_world_is_refused_before_anything_is_collected(tmp_path: Path, job: str) -> None:
     EpisodeStore.create_or_open(tmp_path / "further", toy.SPEC, {})

@@ -75,6 +75,14 @@ def test_anything_that_can_be_drawn_can_be_shown(tmp_path: Path, figures: list[F
     assert all(axes.has_data() for panel in (five, one) for axes in panel.values())
 
 
+def test_a_component_that_differs_by_rounding_alone_has_a_panel(tmp_path: Path, figures: list[Figure]) -> None:
+    actions = EPISODES[0].actions.copy()
+    actions[:, 0] = 1.5707964
+    actions[::2, 0] = 1.5707965
+    _, text = described(add(tmp_path / "still", [replace(EPISODES[0], actions=actions)]))
+    assert text and figures
+
+
 def test_a_store_that_was_put_together_says_of_what(tmp_path: Path) -> None:
     store = add(tmp_path / "store", EPISODES)
     derive_store([store], tmp_path / "chosen", {"seed": [1, 2]})

@@ -368,16 +368,19 @@ def test_an_interrupted_instruction_is_not_sent(start: Callable[..., Started], p
 
 
 def test_an_instruction_that_no_agent_obeys_is_an_error(start: Callable[..., Started], probe: Probe) -> None:
-    probe.node.create_subscription(String, "/user/command", lambda message: None, 1)  # as a recorder does
-    said = start("vla.deploy.say", "")
+    heard: list[str] = []
+    probe.node.create_subscription(String, "/user/command", lambda message: heard.append(message.data), 1)
+    said = start("vla.deploy.say", "lift the block")
+    probe.until(lambda: heard)  # as by a recorder
     assert said.wait(30) == 1 and "waiting for /vla_agent to subscribe to /user/command" in said.printed()
+    assert heard == ["lift the block"]
     agent = LifecycleNode("vla_agent", context=probe.context)
     agent.create_subscription(String, "/user/command", lambda message: None, 1)
     probe.executor.add_node(agent)
     with ThreadPoolExecutor() as threads:
         said = threads.submit(start("vla.deploy.say", "push the block").printed, 30)
         probe.until(said.done)
-    assert "/vla_agent is unconfigured and ignores instructions: ros2 lifecycle set /vla_agent act" in said.result()
+    assert "unconfigured and ignores instructions: ros2 lifecycle set /vla_agent configure, ros2 life" in said.result()
     agent.destroy_node()
 
 

@@ -217,6 +217,16 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path: Path) -> None:
         EpisodeStore(store.folder)
 
 
+def test_configs_that_a_collection_takes_for_one_are_one_when_stores_are_merged(tmp_path: Path) -> None:
+    first, second = (
+        add(tmp_path / "first", MORE[:4], limit=10.0),
+        add(tmp_path / "second", MORE[2:], limit=10, new=None),
+    )
+    derive_store([first, second], tmp_path / "merged")
+    merged = EpisodeStore(tmp_path / "merged")
+    assert [entry.seed for entry in merged.attempts] == [episode.seed for episode in MORE] and not merged.is_derived
+
+
 def test_two_processes_do_not_write_one_new_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = add(tmp_path / "store", EPISODES)
 

@@ -9,11 +9,12 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -31,7 +32,8 @@ from vla.config.adopt import adopt, finetune, resume
 from vla.config.annotations import locate
 from vla.config.build import build
 from vla.config.compose import compose_task
-from vla.config.experiment import to_plain
+from vla.config.experiment import Experiment, to_plain
+from vla.jobs.preview import recording
 
 EXAMPLE = Path(__file__).parent / "example_package"
 ROOT = Path(__file__).parents[1]
@@ -185,6 +187,21 @@ def test_each_stage_is_a_job_of_its_own(home: Path, importable: None) -> None:
 def test_its_recorder_keeps_what_a_preview_shows(home: Path, importable: None) -> None:
     here(home, "job=preview", "experiment=mine", "recorder=mine", "preview.episodes=2", "output=look")
     assert sorted(path.name for path in (home / "look/recordings").iterdir()) == ["0.jsonl", "1.jsonl"]
+
+
+def test_folders_of_a_recorder_are_replaced_by_those_of_the_next_preview(tmp_path: Path) -> None:
+    def make_recorder(folder: Path) -> Callable[[], Any]:
+        def make() -> None:
+            (folder / "0").mkdir()
+            (folder / "0/frame.png").touch()
+
+        return make
+
+    for _ in range(2):
+        experiment = cast(Experiment, SimpleNamespace(make_recorder=make_recorder))
+        with recording(experiment, tmp_path / "look.rrd") as (_, files):
+            pass
+        assert files == [tmp_path / "recordings/0"] and (tmp_path / "recordings/0/frame.png").is_file()
 
 
 def test_its_demonstrations_are_described_replayed_and_exported(home: Path, importable: None) -> None:

@@ -73,7 +73,8 @@ def test_a_world_with_sharper_cameras_has_its_images_resized_by_the_policy() -> 
         np.testing.assert_array_equal(agent.act(seen), expected[0])
 
 
-def test_what_does_not_fit_is_said_and_no_memory_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+def watch_memory(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of the shared memory that is made from now on."""
     used: list[str] = []
 
     def made(*arguments: Any, **options: Any) -> SharedMemory:
@@ -82,6 +83,18 @@ def test_what_does_not_fit_is_said_and_no_memory_is_left_behind(monkeypatch: pyt
         return memory
 
     monkeypatch.setattr("vla.rollouts.shared_policy.SharedMemory", made)
+    return used
+
+
+def require_gone(names: list[str]) -> None:
+    assert names
+    for name in names:
+        with pytest.raises(FileNotFoundError):
+            SharedMemory(name)
+
+
+def test_what_does_not_fit_is_said_and_no_memory_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    used = watch_memory(monkeypatch)
     with shared_policy(lambda: as_policy(make_bc())) as make_agent:
         with pytest.raises(ValueError, match=r"the policy has cameras = \('eye',\), but the task has"):
             make_agent(ToyEnvironment(spec=SPEC.from_dict({**SPEC.to_dict(), "cameras": ["ear"]})))
@@ -96,10 +109,7 @@ def test_what_does_not_fit_is_said_and_no_memory_is_left_behind(monkeypatch: pyt
             with pytest.raises(ValueError, match="an instruction has at most 1000 characters"):
                 agent.reset("a" * 1001, 0)
             assert agent.act(seen).shape == (3,)
-    assert used
-    for name in used:
-        with pytest.raises(FileNotFoundError):
-            SharedMemory(name)
+    require_gone(used)
 
 
 def test_a_failure_while_a_worker_begins_ends_the_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,14 +125,14 @@ def test_a_failure_while_a_worker_begins_ends_the_evaluation(monkeypatch: pytest
         evaluate(Telling, make_agent, no_space, SEEDS)
     with pytest.raises(UserError, match="no expert"), shared_policy(lambda: policy) as make_agent:
         evaluate(Telling, partial(SupervisedAgent, make_agent, on_new_expert), None, SEEDS)
-    memory = [*Path("/dev/shm").iterdir()]
+    used = watch_memory(monkeypatch)
     monkeypatch.setattr(os, "posix_fallocate", no_space)
     with (
         pytest.raises(UserError, match=r"no 0\.0 MB of shared mem"),
         shared_policy(lambda: policy) as make_agent,
     ):
         evaluate(Telling, make_agent, None, SEEDS)
-    assert [*Path("/dev/shm").iterdir()] == memory
+    require_gone(used)
     monkeypatch.setattr("vla.rollouts.shared_policy.SharedMemory", no_space)
     with pytest.raises(OSError, match="No space left"), shared_policy(lambda: policy) as make_agent:
         evaluate(Telling, make_agent, None, SEEDS)

@@ -248,6 +248,14 @@ def test_cells_on_recordings_are_compared_by_their_errors(tmp_path: Path) -> Non
     assert "0.600" in page and "not compared" not in page and not (tmp_path / "sweep.png").exists()
 
 
+def test_a_condition_that_some_trainings_of_a_row_lack_is_no_error(tmp_path: Path) -> None:
+    for number, conditions in enumerate([("dark",), (), ("dark",), ("dark",)]):
+        config = {"task": {"light": 1}, "evaluate": {"conditions": {name: {"light": 0} for name in conditions}}}
+        drawn = [f"model={'bc' if number < 2 else 'rt1'}", f"seed={number % 2}"]
+        cell(tmp_path, number, drawn, 5, conditions=conditions, config=config)
+    assert ("rt1", "bc", "seen") in compare_rows(tabulate(tmp_path))
+
+
 def test_several_trainings_count_as_fewer_episodes_in_a_comparison(tmp_path: Path) -> None:
     for number, (model, successes) in enumerate([("bc", 9), ("bc", 9), ("rt1", 1), ("rt1", 9)]):
         cell(tmp_path, number, [f"model={model}", f"seed={number % 2}"], successes)

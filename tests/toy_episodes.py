@@ -6,6 +6,7 @@ import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from toy import ARM_SPEC, ToyExpert, make_arm
 
@@ -22,8 +23,10 @@ EPISODES = [rollout(make_arm(), ToyExpert(), seed) for seed in range(5)]  # seed
 CODECS = [Codec("raw"), Codec("lossless"), Codec("jpeg", 95)]
 
 
-def add(folder: Path, episodes: list[Episode], codec: Codec | None = None, spec: Spec = ARM_SPEC) -> EpisodeStore:
-    store = EpisodeStore.create_or_open(folder, spec, CONFIG, codec)
+def add(
+    folder: Path, episodes: list[Episode], codec: Codec | None = None, spec: Spec = ARM_SPEC, **config: Any
+) -> EpisodeStore:
+    store = EpisodeStore.create_or_open(folder, spec, {**CONFIG, **config}, codec)
     with store.writing():
         for episode in episodes:
             if episode.success:

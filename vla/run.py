@@ -79,8 +79,8 @@ def _describe(error: Exception) -> str:
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         _, resolver, reason = text.splitlines()[0].partition("UserError raised while resolving interpolation: ")
         return reason if resolver else f"{error.full_key}: {text.splitlines()[0]}"
-    if (parts := text.partition("invalid literal for int() with base 10: "))[1]:  # by OmegaConf, of a list's key
-        return f"{parts[2]} is no item of a list: these have numbers, from 0"
+    if type(error) is ValueError and text.startswith("invalid literal for int()"):  # by OmegaConf, of a list's key
+        return f"{text.rpartition(': ')[2]} is no item of a list: these have numbers, from 0"
     if isinstance(error, OSError) and error.filename:
         return f"{error.filename}: {error.strerror}"
     return text

@@ -80,7 +80,7 @@ class Evaluation:
 
     episodes: Count  # with `until`, at most
     seed: UnseenSeed  # of the first episode
-    until: Literal["decided"] | None  # stop as soon as `bar`, `against` and the differences of conditions are decided
+    until: Literal["decided"] | None  # stop as soon as `bar` and `against` are, and conditions as differences are
     bar: OpenShare | None  # success rate to compare with
     against: Text | None  # run to compare with on the same episodes
     margin: OpenShare  # loss of success that counts as not worse

@@ -61,8 +61,10 @@ def _commits() -> dict[str, str]:
             tree, commit = output.splitlines()
             # Files that git does not know can be chosen, too.
             status = _git(folder, "--no-optional-locks", "status", "--porcelain", "--", ".")
-            if status != "":  # None: git took too long
-                trees[tree] = f"{commit} {'perhaps ' if status is None else ''}{DIRTY}"
+            if status:
+                trees[tree] = f"{commit} {DIRTY}"
+            elif status is None and DIRTY not in trees.get(tree, ""):  # git took too long
+                trees[tree] = f"{commit} perhaps {DIRTY}"
             trees.setdefault(tree, commit)
     names = [Path(tree).name for tree in trees]
     return {tree if names.count(name) > 1 else name: trees[tree] for tree, name in zip(trees, names, strict=True)}

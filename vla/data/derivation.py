@@ -16,6 +16,7 @@ from vla.data.episodes import DamageError, EpisodeStore
 from vla.data.header import Codec
 from vla.data.index import DAMAGED, LOST, Entry
 from vla.data.verification import entries_by_config, episode_of, without_rows
+from vla.io.documents import canonicalize
 from vla.io.errors import UserError
 from vla.io.files import atomic_path, remove_drafts, try_lock
 from vla.io.printable import track
@@ -73,9 +74,10 @@ def _require_new(folder: Path) -> None:
 def _choose(stores: Sequence[EpisodeStore], where: Mapping[str, Any]) -> EpisodeSelection:
     matches = episode_filter(where, [entry for store in stores for entry in store.attempts])
     selection: EpisodeSelection = {}
+    keys = dict[str, str]()  # config as it is compared → the first one, as it is written
     for store in stores:
         for config, entries in entries_by_config(store):
-            key = json.dumps(config)
+            key = keys.setdefault(json.dumps(canonicalize(config)), json.dumps(config))
             for entry in filter(matches, entries):
                 selection.setdefault(key, {}).setdefault(entry.seed, []).append((store, entry))
     return selection

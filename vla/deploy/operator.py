@@ -88,7 +88,8 @@ class Operator:
 
     def say(self, instruction: str) -> None:
         """Publish an instruction once the agent and all other subscribers are discovered, and wait until they confirm
-        it; a UserError if the agent is not active, because it then ignores instructions."""
+        it. Raises a UserError if the agent is not active, because it then ignores instructions, or if there is none;
+        others, such as a recorder, have got the instruction then."""
         topic, found, since = self._words.topic_name, 0, time.monotonic()
 
         def settled() -> bool:  # they are discovered one by one, in any order: the simulator may come before the agent
@@ -98,13 +99,20 @@ class Operator:
             names = [subscriber.node_name for subscriber in self.node.get_subscriptions_info_by_topic(topic)]
             return AGENT.strip("/") in names and time.monotonic() - since > SETTLING_TIME
 
-        self.wait(settled, f"{AGENT} to subscribe to {topic}")
+        try:
+            self.wait(settled, f"{AGENT} to subscribe to {topic}")
+        except UserError:
+            self._words.publish(String(data=instruction))
+            self._words.wait_for_all_acked(Duration(seconds=TIMEOUT))
+            raise
         self._words.publish(String(data=instruction))
         if not self._words.wait_for_all_acked(Duration(seconds=TIMEOUT)):
             raise UserError("a subscriber does not confirm the instruction: does one of the nodes hang?")
         state = self.call(GetState, f"{AGENT}/get_state", GetState.Request()).current_state
         if state.id != State.PRIMARY_STATE_ACTIVE:
-            raise UserError(f"{AGENT} is {state.label} and ignores instructions: ros2 lifecycle set {AGENT} activate")
+            steps = ["activate"] if state.id == State.PRIMARY_STATE_INACTIVE else ["configure", "activate"]
+            remedy = ", ".join(f"ros2 lifecycle set {AGENT} {step}" for step in steps)
+            raise UserError(f"{AGENT} is {state.label} and ignores instructions: {remedy}")
 
     def describe(self) -> str:
         """Return the agent's status: its reason, then a line for each value."""

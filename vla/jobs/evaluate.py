@@ -93,7 +93,9 @@ def evaluate_closed_loop(experiment: Experiment, checkpoint: Path | None, statem
         report = finished.reports[IN_DISTRIBUTION]
         _conclude([*finished.statements, str(report)])
         return report.success
-    conclusions = list[str]()
+    against, conclusions = experiment.evaluate.against, list[str]()
+    if against and Path(against).resolve() != output.resolve():  # it may have been evaluated again during the training
+        statements = _statements(experiment)
     _ = experiment.origin, experiment.changes  # determine them now, before the code may change
     try:
         with PlayedEpisodes(output, identity) as played:
@@ -135,9 +137,9 @@ def _identity(experiment: Experiment, checkpoint: Path | None) -> dict[str, Any]
 
 
 def _digest(folder: str | None) -> str | None:
-    """Return the SHA-256 of the index of an episode store; None for any other folder."""
-    index = Path(folder or "") / INDEX
-    return hashlib.sha256(index.read_bytes()).hexdigest() if index.is_file() else None
+    """Return the SHA-256 of the index of an episode store; None for no folder, and any other."""
+    index = Path(folder) / INDEX if folder else None
+    return hashlib.sha256(index.read_bytes()).hexdigest() if index and index.is_file() else None
 
 
 def _condition_identity(options: Evaluation, name: str) -> str:
@@ -264,15 +266,18 @@ def require_possible(experiment: Experiment) -> list[Statement]:
                 _require_distinct(name, world, options)
                 if trains and not changes:
                     _require_unseen_in_validation(world, experiment.validate.seeds, options.seeds)
-                elif not changes and experiment.checkpoint and (selected := _validation(experiment.checkpoint)):
+                elif not changes and (selected := _validation(experiment)):
                     _require_unseen_in_validation(world, selected, options.seeds)
     return statements
 
 
-def _validation(checkpoint: Path) -> range | None:
-    """Return the seeds whose episodes selected the weights of a policy, if that is known."""
-    validation = read_policy(checkpoint).training.validation
-    return range(validation[0], sum(validation)) if validation else None
+def _validation(experiment: Experiment) -> range | None:
+    """Return the seeds whose episodes in this task selected the weights of the policy to evaluate, if known."""
+    saved = read_policy(experiment.checkpoint) if experiment.checkpoint else None
+    if saved is None or saved.training.validation is None or saved.config["task"] != experiment["task"]:
+        return None
+    first, count = saved.training.validation
+    return range(first, first + count)
 
 
 def _changed_parts(changes: Mapping[str, Any]) -> frozenset[tuple[str, ...]]:

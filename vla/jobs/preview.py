@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -60,4 +61,7 @@ def recording(experiment: Experiment, target: Path) -> Iterator[tuple[Recorder |
         for file in sorted(Path(folder).iterdir()):
             if file.suffix not in SUFFIXES:
                 (target.parent / RECORDINGS).mkdir(exist_ok=True)
-                files.append(file.replace(target.parent / RECORDINGS / file.name))
+                place = target.parent / RECORDINGS / file.name
+                if place.is_dir():  # of an earlier preview, which no other folder can replace
+                    shutil.rmtree(place)
+                files.append(file.replace(place))

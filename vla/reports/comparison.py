@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -24,6 +23,7 @@ from vla.spec import IN_DISTRIBUTION
 # Names of the second row, of the first one, and condition → what is compared → comparison.
 Comparisons = Mapping[tuple[str, ...], Mapping[str, Comparison]]
 CASE = ("second", "minus first", "condition")
+PICTURES = ("image_size", "renderer", "cameras", "detail")  # keys of a task that change its pictures, not its scenes
 
 
 def read_runs(folders: Sequence[Path]) -> dict[str, Run]:
@@ -65,7 +65,8 @@ def compare(pairs: Iterable[tuple[SweepRow, SweepRow]], margin: float) -> Compar
 
 def _repeats_training_condition(runs: Sequence[Run], condition: str) -> bool:
     """Return whether a condition changes the task of none of the runs, so that its episodes are those of `seen`."""
-    return condition != IN_DISTRIBUTION and all(run.reports[condition] is run.reports[IN_DISTRIBUTION] for run in runs)
+    reports = [run.reports for run in runs if condition in run.reports]
+    return condition != IN_DISTRIBUTION and all(each[condition] is each[IN_DISTRIBUTION] for each in reports)
 
 
 def _compare_rows(one: SweepRow, other: SweepRow, condition: str) -> dict[str, Comparison]:
@@ -77,7 +78,7 @@ def _compare_rows(one: SweepRow, other: SweepRow, condition: str) -> dict[str, C
         return compare_results(together, anytime)
     first, second = (_by_seed(run, condition) for run in runs)
     if common_seeds := first.keys() & second.keys():  # then each of them must be of the same world in both samples
-        same_world = not any(first[seed][1].isdisjoint(second[seed][1]) for seed in common_seeds)
+        same_world = all(first[seed][1] == second[seed][1] for seed in common_seeds)
     else:
         same_world = _scenes(runs[0], condition) == _scenes(runs[1], condition)
     if anytime or not (first and second and same_world):
@@ -111,6 +112,9 @@ def remarks(runs: Mapping[str, Run], comparisons: Comparisons | None = None) -> 
         if report.errors
     ]
     names_by_remark = {
+        "not compared, because no episode was played": [
+            name for name, run in runs.items() if comparisons is not None and not run.report
+        ],
         "not compared, because no episode is the same in both": [f"{one} and {other}" for one, other in pairs],
         "not compared under a condition, because its worlds differ": conditions_left_out,
         "evaluated with different versions": [f"{n} {' and '.join(v)}" for n, v in versions.items() if len(v) > 1],
@@ -138,35 +142,27 @@ def common_episodes(one: Run, other: Run, condition: str) -> list[tuple[Result, 
     """Return both results of every episode that two runs completed under a condition, in the order of seeds."""
     first, second = (_by_seed(run, condition) for run in (one, other))
     # The same seed gives another episode under another goal or level of randomisation.
-    seeds = [seed for seed in sorted(first.keys() & second.keys()) if not first[seed][1].isdisjoint(second[seed][1])]
-    return [(first[seed][0], second[seed][0]) for seed in seeds]
+    seeds = [seed for seed, (_, scene) in first.items() if seed in second and scene == second[seed][1]]
+    return [(first[seed][0], second[seed][0]) for seed in sorted(seeds)]
 
 
-def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, set[str]]]:
-    """Return seed → result under a condition, and keys of which one is equal for equal scene and instruction.
+def _by_seed(run: Run, condition: str) -> dict[int, tuple[Result, Any]]:
+    """Return seed → result under a condition, and a key that is equal for equal scene and instruction.
 
-    Where no draws are saved, as under other conditions than the first, the config must be equal, or the episode of the
-    first condition and what is changed.
+    For other conditions than the first, and for some worlds, only the config tells what was drawn.
     """
-    scenes, changes = _scenes(run, condition), _changes(run, condition)
-    training = run.reports.get(IN_DISTRIBUTION, Report(())).results
-    drawn = {each.seed: {_key(each.episode, changes, scenes[1:])} for each in training if each.draws}
+    results, scenes = run.reports.get(condition, Report(())).results, _scenes(run, condition)
     return {
-        each.seed: (each, {_key(each.episode, None if each.draws else scenes)} | drawn.get(each.seed, set()))
-        for each in run.reports.get(condition, Report(())).results
-        if each.outcome != ERROR
+        each.seed: (each, (each.episode, None if each.draws else scenes)) for each in results if each.outcome != ERROR
     }
-
-
-def _key(*values: Any) -> str:
-    return json.dumps(values, sort_keys=True, default=str)
 
 
 def _scenes(run: Run, condition: str) -> tuple[Any, ...]:
     """Return the config values that determine the scenes: the task with the changes of a condition, and its network."""
     config, changes = run.report.config if run.report else {}, _changes(run, condition)
-    task = value_at(config, "task")
-    world = with_changes(task, changes) if changes and isinstance(task, dict) else task
+    world = value_at(config, "task")
+    if isinstance(world, dict):
+        world = {name: value for name, value in with_changes(world, changes or {}).items() if name not in PICTURES}
     return world, changes is None, value_at(config, "evaluate.networks", {}).get(condition)
 
 

@@ -128,4 +128,8 @@ def _plot_values(axes: Axes, values: Sequence[Any]) -> None:
 def _plot_numbers(axes: Axes, values: Array, log: bool = False) -> None:
     """Plot a histogram of numbers (N,), perhaps with a logarithmic axis."""
     axes.locator_params(axis="x", nbins=5)
-    axes.hist(values, int(np.clip(np.sqrt(len(values)), 8, 40)), color=BLUE, log=log)
+    values = np.asarray(values, np.float64)
+    low, high = values.min(), values.max()
+    if high - low < 1e-6 * max(1.0, abs(low), abs(high)):  # nothing but rounding, too little for bins
+        low, high = low - 0.5, high + 0.5
+    axes.hist(values, int(np.clip(np.sqrt(len(values)), 8, 40)), (low, high), color=BLUE, log=log)

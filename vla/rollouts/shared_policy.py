@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
+from errno import EMFILE, ENFILE, ENOBUFS, ENOMEM
 from functools import partial
 from itertools import count
 from multiprocessing import AuthenticationError
@@ -96,8 +97,9 @@ def _accept(listener: Listener, begin: Callable[[int, Connection, Spec], Future[
         except (AuthenticationError, EOFError, ConnectionError):  # of other programs that find the socket
             continue
         except OSError as error:
-            log.warning("a worker waits for the policy: %s", error)
-            time.sleep(1)  # until another one has left
+            if error.errno in (EMFILE, ENFILE, ENOBUFS, ENOMEM):
+                log.warning("a worker waits for the policy: %s", error)
+                time.sleep(1)  # until another one has left
 
 
 def _serve(policy: _Planner, requests: queue.Queue[Request | None]) -> None:

@@ -63,7 +63,7 @@ class LeRobotExporter:
         store.require_episodes()
         episodes = [provenance(entry) for entry in store.episodes]
         source = {"spec": store.spec.to_dict(), "crf": self._crf, "episodes": episodes}
-        if self._folder.is_mount():  # which no other folder can replace
+        if self._folder.is_mount() and not _is_complete(self._folder, source):  # which no other folder can replace
             raise UserError(f"{self._folder} is where a disk is mounted: choose a new folder on it as export.folder")
         with staging_folder(self._folder, self._folder.with_name(f".{self._folder.name}{UNFINISHED}")) as staging:
             if _is_complete(self._folder, source):

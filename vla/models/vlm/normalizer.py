@@ -45,8 +45,8 @@ class Normalizer(nn.Module):
         """Compute the statistics of (N, W) values.
 
         The extremes of a component that rarely changes, such as a gripper, take the place of its percentiles, or its
-        changes would be huge. One that never changes gets `constant` as its standard deviation, or half its range, and
-        of the others both are at least `floor`: what is noise in these values may be a motion in others.
+        changes would be huge. Standard deviation and half the range are at least `floor`, because what is noise here
+        may be a motion in other values, and of a component that never changes also at least `constant`.
         """
         minimum, maximum = values.min(0), values.max(0)
         floor = np.where(maximum - minimum > CONSTANT, floor, np.maximum(floor, constant))

@@ -85,7 +85,7 @@ class OutcomeClassifier:
 
 
 def _height(state: WorldState, block: int) -> float:
-    """Return the height of a block above the table, or above another block that it overlaps from above [m]."""
+    """Return the height of a block above the table, or above another block that its centre is over [m]."""
     bottom, tops = state.positions[block, 2] - state.extents[block, 2], state.positions[:, 2] + state.extents[:, 2]
     apart = np.abs(state.positions[:, :2] - state.positions[block, :2]).max(axis=1)
     below = (apart < state.extents[:, :2].max(axis=1)) & (tops < state.positions[block, 2])
