@@ -379,6 +379,23 @@ def test_an_arm_in_the_hands_of_a_person_is_not_commanded_and_goes_on_from_where
     assert world.loop.state is State.RUNNING and np.abs(steps).sum() > 0.01
 
 
+def after_a_gap(world: World) -> None:
+    """Measure a moving arm once, after some time without joint states."""
+    world.measures = False
+    world.run(1.5)
+    world.loop.observer.add_joint_state(JointMeasurement(world.now, world.joints + 0.4, np.ones(7), 0.08))
+
+
+def test_an_overdue_plan_is_not_followed_even_if_nobody_looked_before(world: World) -> None:
+    world.answer = lambda observation: None
+    world.run(0.2)  # asks
+    world.loop.drop_overdue(world.now)
+    assert world.loop.state is State.RUNNING
+    world.loop.drop_overdue(world.now + SAFETY.inference + 0.1)
+    assert not world.loop.set_plan(FORWARD)
+    assert world.loop.state is State.HOLDING and "inference takes longer" in world.loop.reason
+
+
 @pytest.mark.parametrize(
     ("move", "says"),
     [
@@ -393,8 +410,9 @@ def test_an_arm_in_the_hands_of_a_person_is_not_commanded_and_goes_on_from_where
             ),
             "still moves",
         ),
+        (after_a_gap, "less than 0.2 s of joint states"),
     ],
-    ids=["outside", "unseen", "moving"],
+    ids=["outside", "unseen", "moving", "seen again"],
 )
 def test_an_arm_is_taken_back_only_at_rest_and_within_its_limits(
     world: World, move: Callable[[World], None], says: str
@@ -402,7 +420,7 @@ def test_an_arm_is_taken_back_only_at_rest_and_within_its_limits(
     handed_over(world)
     world.run(0.5)
     move(world)
-    if "moves" not in says:
+    if "moves" not in says and "less" not in says:
         world.run(0.5)
     with pytest.raises(ValueError, match=says):
         world.loop.take_back(world.now)

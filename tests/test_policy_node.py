@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from fake_batch import as_policy, make_bc
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import GetState
+from rclpy.duration import Duration
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64MultiArray
 from test_server import remote, serving
@@ -94,6 +95,7 @@ def test_invalid_images_hold_the_arm(world: World, capfd: pytest.CaptureFixture[
         "s in the future: synchronise the clocks": lambda image: setattr(
             image.header.stamp, "sec", image.header.stamp.sec + 2
         ),
+        "front: its time stamp is 36": lambda image: setattr(image.header.stamp, "sec", image.header.stamp.sec + 3650),
     }
     for words, world.changed in invalid.items():
         assert world.becomes(State.HOLDING)
@@ -240,6 +242,15 @@ def test_joint_states_that_are_late_or_frozen_hold_the_arm(world: World, capfd: 
         assert world.state is State.HOLDING
         assert world.statuses[-1].message.startswith("no joint state within the last 0.2 s")
         assert words in capfd.readouterr().err
+
+
+def test_a_stop_is_not_replaced_by_the_instruction_that_follows_it(world: World) -> None:
+    world.say("")
+    world.words.wait_for_all_acked(Duration(seconds=5))  # while the node is busy with something else
+    world.say("put the red block on the pad")
+    assert world.becomes(State.STOPPED)
+    world.live(0.5)
+    assert world.state is State.STOPPED
 
 
 def test_an_instruction_too_long_is_dropped_and_the_former_one_followed(

@@ -128,7 +128,7 @@ class ControlLoop:
         """Command the arm again, from its measured pose; the gripper stays as it is until the policy moves it. Raises a
         UserError if the arm moves, is outside its limits, or has no recent joint state; the person then keeps it."""
         joint_state = self.observer.newest_joint_state
-        if (problem := self._joints_problem(now)) or joint_state is None:
+        if (problem := self._joints_problem(now) or self._history_problem()) or joint_state is None:
             raise UserError(problem)
         if self.observer.displacement(REST_TIME) > REST_MOTION:
             raise UserError("the arm still moves: let it rest first")
@@ -199,6 +199,11 @@ class ControlLoop:
             joint_state = None if self._follows_positions else self.observer.newest_joint_state
             self.motion.follow(waypoints, None if joint_state is None else joint_state.joints)
         return follows
+
+    def drop_overdue(self, now: float) -> None:
+        """Hold if the inference under way is overdue, so that its plan is not followed even if nobody looked before."""
+        if problem := self._inference_problem(now):
+            self.hold(problem)
 
     def reject_plan(self, reason: str) -> None:
         """Count a failed inference, unless the arm has been handed over since it began."""
@@ -272,9 +277,11 @@ class ControlLoop:
             return problem
         if problem := self._joints_problem(now):
             return problem
-        if self._request is not None and now - self._request.since > self.safety.inference:
-            return f"inference takes longer than {self.safety.inference} s"
-        return ""
+        return self._inference_problem(now)
+
+    def _inference_problem(self, now: float) -> str:
+        overdue = self._request is not None and now - self._request.since > self.safety.inference
+        return f"inference takes longer than {self.safety.inference} s" if overdue else ""
 
     def _joints_problem(self, now: float) -> str:
         """Say that the newest joint state is too old, or that there is none, or that joint states jump; else ""."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -16,9 +15,12 @@ from vla.deploy.control_loop import ControlLoop
 from vla.deploy.diagnostics import Diagnostics
 from vla.deploy.lifecycle_node import GuardedLifecycleNode
 from vla.deploy.observer import MAX_CLOCK_ERROR, MAX_STAMP_AGE
+from vla.deploy.safety import clock
 from vla.deploy.settings import COMPRESSED, PolicySettings
 from vla.io.errors import UserError
 from vla.spec import LONGEST_INSTRUCTION
+
+INSTRUCTIONS = 100  # that may wait while the node is busy
 
 
 class Inputs:
@@ -45,12 +47,13 @@ class Inputs:
             node.add_subscription(kind, topics.images[camera], partial(self._on_image, camera), best_effort)
         for topic in filter(None, {topics.joint_states, topics.finger_states}):
             node.add_subscription(JointState, topic, self._on_joint_state, best_effort)
-        node.add_subscription(String, topics.instruction, self._on_instruction, QoSProfile(depth=1))
+        # None replaces another: one that stops the arm might be followed at once by one of somebody else.
+        node.add_subscription(String, topics.instruction, self._on_instruction, QoSProfile(depth=INSTRUCTIONS))
 
     def _on_image(self, camera: str, message: Any) -> None:
         if not self._node.active:
             return
-        now = time.monotonic()
+        now = clock()
         try:
             age = self._age(camera, message)  # first, because decoding takes time
             image = messages.image_from(message)
@@ -73,7 +76,7 @@ class Inputs:
         age = self._node.get_clock().now().nanoseconds * 1e-9 - (stamp[0] + stamp[1] * 1e-9)
         if age >= MAX_STAMP_AGE and source in self._synchronised:
             raise UserError(f"its time stamp is {age:.0f} s old")
-        if -MAX_STAMP_AGE < age < -MAX_CLOCK_ERROR:
+        if age < -MAX_CLOCK_ERROR and (age > -MAX_STAMP_AGE or source in self._synchronised):
             raise UserError(f"its time stamp is {-age:.2f} s in the future: synchronise the clocks")
         if not 0 <= age < MAX_STAMP_AGE:
             return 0.0
@@ -81,7 +84,7 @@ class Inputs:
         return age
 
     def _on_joint_state(self, message: JointState) -> None:
-        now = time.monotonic()
+        now = clock()
         if not self._node.active:
             return
         try:
@@ -102,7 +105,7 @@ class Inputs:
             limit = f"an instruction of {length} characters, the limit is {LONGEST_INSTRUCTION}: {quotation}"
             return self._diagnostics.drop(limit)
         is_repetition = instruction == loop.instruction
-        if loop.on_instruction(instruction, time.monotonic()):
+        if loop.on_instruction(instruction, clock()):
             if not is_repetition:
                 self._node.get_logger().info(f"instruction: {quotation}")
         elif instruction:

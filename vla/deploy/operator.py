@@ -47,7 +47,7 @@ class Operator:
 
     def __init__(self, node: Any, topic: str, processes: Sequence[BaseProcess] = ()) -> None:
         self.node, self._processes = node, processes
-        self._words = node.create_publisher(String, topic, 1)
+        self._words = node.create_publisher(String, topic, 10)
         self.status: DiagnosticStatus | None = None  # newest of the agent
         node.create_subscription(DiagnosticStatus, f"{AGENT}/status", self._on_status, LATCHED_QOS)
 

@@ -18,7 +18,7 @@ from vla.deploy.diagnostics import Diagnostics
 from vla.deploy.inference import Inference
 from vla.deploy.inputs import Inputs
 from vla.deploy.lifecycle_node import GuardedLifecycleNode, transition
-from vla.deploy.safety import State
+from vla.deploy.safety import State, clock
 from vla.deploy.settings import PolicySettings
 from vla.io.errors import UserError
 from vla.policy import Policy
@@ -150,15 +150,17 @@ class PolicyNode(GuardedLifecycleNode):
 
     def _on_stop(self, request: Any, response: Any) -> Any:
         response.success = self.active
-        if self.loop is not None:
-            self.loop.stop("stopped by request")
-            self.diagnostics.report()  # before an instruction is ignored, whose warning this would clear
+        if self.loop is None or not self.active:
+            response.message = "the agent is not active"
+            return response
+        self.loop.stop("stopped by request")
+        self.diagnostics.report()  # before an instruction is ignored, whose warning this would clear
         return response
 
     def _on_resume(self, request: Any, response: Any) -> Any:
         loop = self.loop if self.active else None
         running_states = (State.RUNNING, State.HOLDING)  # an instruction that came before has ended a stop by time-out
-        response.success = loop is not None and (loop.resume(time.monotonic()) or loop.state in running_states)
+        response.success = loop is not None and (loop.resume(clock()) or loop.state in running_states)
         response.message = "" if response.success else f"nothing to resume: {loop.reason if loop else 'inactive'}"
         return response
 
@@ -174,7 +176,7 @@ class PolicyNode(GuardedLifecycleNode):
                 loop.hand_over()
             elif not request.data and loop.handed_over:
                 self._require_command()
-                loop.take_back(time.monotonic())
+                loop.take_back(clock())
             response.success = True
             self.diagnostics.report()
         except UserError as error:
@@ -182,7 +184,7 @@ class PolicyNode(GuardedLifecycleNode):
         return response
 
     def _tick(self) -> None:
-        now = time.monotonic()
+        now = clock()
         if self._last_tick is not None:
             self.diagnostics.record("tick", now - self._last_tick)
         self._last_tick = now
@@ -199,7 +201,8 @@ class PolicyNode(GuardedLifecycleNode):
         try:
             if (result := inference.take()) is not None:
                 plan, seconds = result
-                follows, delay = loop.set_plan(plan), time.monotonic() - loop.observation_time
+                loop.drop_overdue(clock())
+                follows, delay = loop.set_plan(plan), clock() - loop.observation_time
                 if follows:
                     loop.delays.add(delay)
                 self.diagnostics.record("inference", seconds)
@@ -207,12 +210,12 @@ class PolicyNode(GuardedLifecycleNode):
         except Exception as error:
             self.get_logger().error(f"the policy failed: {traceback.format_exc()}", throttle_duration_sec=1.0)
             loop.reject_plan(f"the policy failed: {error}")
-        if not inference.busy and (observation := loop.next_observation(time.monotonic())) is not None:
+        if not inference.busy and (observation := loop.next_observation(clock())) is not None:
             inference.start(observation, loop.resumed)
 
     def _send(self, loop: ControlLoop) -> None:
         """Pass this tick's command on."""
-        now = time.monotonic()
+        now = clock()
         if (command := loop.command(now)) is not None:
             self._arm.publish(command, now)
             if self._gripper:

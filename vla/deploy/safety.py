@@ -5,6 +5,7 @@ All times are seconds on one monotonic clock.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -13,6 +14,11 @@ import numpy as np
 from vla.deploy.motion import Motion
 from vla.deploy.observer import JointMeasurement
 from vla.io.types import Count, Point, Positive
+
+
+def clock() -> float:
+    """Return the time [s] on a clock that is never set, and goes on while the computer sleeps, where there is one."""
+    return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 class State(StrEnum):
