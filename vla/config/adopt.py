@@ -190,9 +190,8 @@ def require_identity(
 
 
 def _with_absolute_model(config: Mapping[str, Any]) -> Mapping[str, Any]:
-    return (
-        {**config, "model": with_absolute_paths(config["model"])} if isinstance(config.get("model"), dict) else config
-    )
+    model = config.get("model")
+    return {**config, "model": with_absolute_paths(model)} if isinstance(model, dict) else config
 
 
 def _moved(value: Any, before: Path, now: Path) -> Any:
