@@ -20,7 +20,7 @@ HIDDEN = {"python": r"_target_ must name a class", "secret": "holds the referenc
 
 
 def sentence(attack: str, way: str) -> str | None:
-    """What is said of an attack on a way to use the policy; None if nothing that is hidden is read there."""
+    """What is said of an attack on a way to use the policy; None, for anything, where none of it is read."""
     if "connection" not in attack:
         return next(said for word, said in HIDDEN.items() if word in attack)
     if way == "improve":
@@ -37,15 +37,11 @@ def test_nothing_that_is_hidden_acts(attack: str, tmp_path: Path, monkeypatch: p
         config = hiding(to_plain(composed("expert=waypoint", "trainer.accelerator=cpu")), mark, port)[attack]
         path = save(tmp_path / "theirs", config)
         small = ("output=mine", "cluster.workers=1", "evaluate.episodes=1", "recorder=none")
-        refused = 0
         for way, do in ways(path, *small).items():
-            if not (says := sentence(attack, way)):
-                continue
-            with pytest.raises(ValueError, match=says):
+            with pytest.raises(ValueError, match=sentence(attack, way)):
                 do()
-            refused += 1
             assert not mark.exists() and not connected(), way
-    assert refused and not [*(tmp_path / "mine").rglob("*")]
+    assert not [*(tmp_path / "mine").rglob("*")]
 
 
 @pytest.mark.parametrize("attack", hidden(to_plain(composed()), Path()))

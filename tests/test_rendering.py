@@ -319,8 +319,9 @@ def test_workers_take_turns_on_the_gpus_of_a_machine(
     for name in ("MUJOCO_EGL_DEVICE_ID", "GLCONTEXT_DEVICE_INDEX", gl.EGL_DEVICE, gl.WORKER):
         monkeypatch.setenv(name, "")  # so that what the code sets is undone, too
         monkeypatch.delenv(name)
-    worker = set_before.pop(gl.WORKER, "2")
-    for name, value in {gl.EGL_DEVICES: "1\n3\n4\n", **set_before}.items():
+    settings = {gl.EGL_DEVICES: "1\n3\n4\n", gl.WORKER: "2", **set_before}
+    worker = settings.pop(gl.WORKER)
+    for name, value in settings.items():
         monkeypatch.setenv(name, value)
     gl.choose_device()  # as the main process does before it starts workers, which inherit its choice
     monkeypatch.setenv(gl.WORKER, worker)
